@@ -209,7 +209,7 @@ def contribution(
 
 
 @dataclass(frozen=True)
-class Pixels:
+class PixelGrid:
     """Every stride-th pixel of every stride-th row of an image, or some of them: their number among those, their index
     in the whole image, x and y, and which are meant (the others lie beyond the end of a run)."""
 
@@ -220,7 +220,7 @@ class Pixels:
     meant: Any
 
 
-def every(e: Engine, width: int, height: int, stride: int) -> Pixels:
+def every(e: Engine, width: int, height: int, stride: int) -> PixelGrid:
     """All of them at once."""
     columns, rows = -(-width // stride), -(-height // stride)
     number = dr.arange(e.UInt, columns * rows)
@@ -228,7 +228,7 @@ def every(e: Engine, width: int, height: int, stride: int) -> Pixels:
 
 
 def summed(
-    e: Engine, shape: tuple[int, int, int], of: tuple[int, int], at: Callable[[Pixels], Contribution], down: bool,
+    e: Engine, shape: tuple[int, int, int], of: tuple[int, int], at: Callable[[PixelGrid], Contribution], down: bool,
     is_steady: bool,
 ) -> Any:  # fmt: skip
     """Sums over every stride-th pixel of an image, shape = width, height, stride, of what `at` gives.
@@ -289,6 +289,6 @@ def _plus(total: tuple[Any, ...], more: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(a + b for a, b in zip(total, more, strict=True))
 
 
-def _pixels(width: int, columns: int, stride: int, column: Any, row: Any, meant: Any) -> Pixels:
+def _pixels(width: int, columns: int, stride: int, column: Any, row: Any, meant: Any) -> PixelGrid:
     x, y = column * stride, row * stride
-    return Pixels(row * columns + column, y * width + x, x, y, meant)
+    return PixelGrid(row * columns + column, y * width + x, x, y, meant)

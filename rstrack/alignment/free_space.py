@@ -23,7 +23,7 @@ from rsgen.device.projection import TO_BASE, gather, move, project_rolling
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.device_frame import DeviceRig
-from rstrack.images.line_poses import IDENTITY_FROM_BASE, from_base_table, to_base_table
+from rstrack.images.line_poses import from_base, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.images.sampling import bilinear, grid, level_size, nearest, surface
 from rstrack.keyframes.keyframe import Reference, pyramid_level, strides
@@ -32,7 +32,6 @@ from rstrack.keyframes.keyframe import Reference, pyramid_level, strides
 _UNKNOWN = 1e6
 # Pixels of the largest grid that is compared: what moves need not be known to the pixel.
 _GRID_PX = 160 * 120
-_IDENTITY_TO_BASE = np.append(np.eye(3).ravel(), np.zeros(3))
 
 Grid = npt.NDArray[np.float32]
 
@@ -101,8 +100,10 @@ def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays:
 
 
 def meeting_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[MeetingInput], Any]:
-    """Kernel → (apart, value) at the same pixels, see `Seen`; `_UNKNOWN` where not to be told, a value of twice that
-    outside the other image."""
+    """Kernel → (apart, value) at the same pixels, see `SeenFrom`.
+
+    `_UNKNOWN` where not to be told; a value of twice that outside the other image.
+    """
     columns = -(-other.camera.width // stride)
 
     @recorded_from(MeetingInput)
@@ -168,7 +169,7 @@ class Free:
 
 
 @dataclass(frozen=True)
-class Seen(Free):
+class SeenFrom(Free):
     """The same, and what else those pixels are, seen from the other image.
 
     apart (m): how far in front of the surface there; intensity: the colour image's, less that expected; outside:
@@ -190,36 +191,26 @@ class FreeSpace:
     def __post_init__(self) -> None:
         self._kernel = Kernels(self.device.e)
 
-    def before_frame(self, ref: Reference, depth: DepthImage, spline: Spline) -> Free:
-        """The keyframe's pixels before a frame's depth image."""
+    def before(self, one: Reference | DepthImage, other: Reference | DepthImage, spline: Spline) -> Free:
+        """The pixels of one image before the other one."""
         with self.device.timer("what moves: compare"):
-            return self._free(ref.lens, depth.exposure.lens, ref.rolling is not None, self._of_ref(ref, depth, spline))
+            return self._free(one, other, self._given(one, other, spline))
 
-    def before_keyframe(self, depth: DepthImage, ref: Reference, spline: Spline) -> Free:
-        """A frame's pixels before the keyframe."""
+    def seen_from(
+        self, one: Reference | DepthImage, other: Reference | DepthImage, values: Any, spline: Spline
+    ) -> SeenFrom:
+        """One image seen from the other. values: on the device, as `intensity` gives them at the keyframe's grid: of
+        `one` if that is a keyframe, else of `other`."""
+        e, lens = self.device.e, _lens(one)
         with self.device.timer("what moves: compare"):
-            return self._free(depth.exposure.lens, ref.lens, True, self._of_frame(depth, ref, spline))
-
-    def keyframe_in_frame(self, ref: Reference, depth: DepthImage, intensity: Any, spline: Spline) -> Seen:
-        """The keyframe seen from a frame's depth image. intensity: differences as `intensity` gives them."""
-        with self.device.timer("what moves: compare"):
-            given = self._of_ref(ref, depth, spline)
-            return self._seen(ref.lens, depth.exposure.lens, ref.rolling is not None, given, intensity, False)
-
-    def frame_in_keyframe(self, depth: DepthImage, ref: Reference, intensity: Any, spline: Spline) -> Seen:
-        """A frame's depth image seen from its keyframe. intensity: differences as `intensity` gives them."""
-        with self.device.timer("what moves: compare"):
-            given = self._of_frame(depth, ref, spline)
-            return self._seen(depth.exposure.lens, ref.lens, True, given, intensity, True)
-
-    def frame_in_frame(self, depth: DepthImage, other: DepthImage, values: Grid, spline: Spline) -> Seen:
-        """A depth image seen from another one, whose values (gh, gw) it is handed as intensities."""
-        e, T_world_base = self.device.e, spline.pose(other.exposure.mid_time)
-        with self.device.timer("what moves: compare"):
-            to_base = e.upload(to_base_table(spline, T_world_base, depth.exposure))
-            from_base = e.upload(from_base_table(spline, T_world_base, other.exposure))
-            given = SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, other.inverse_z, from_base)
-            return self._seen(depth.exposure.lens, other.exposure.lens, True, given, e.upload(values), True)
+            given = self._given(one, other, spline)
+            near = self._free(one, other, given)
+            has_rays = isinstance(one, DepthImage) or one.rolling is not None
+            kernel = self._kernel(meeting_kernel, lens, _lens(other), grid_of(lens)[1], has_rays)
+            apart, handed = kernel(MeetingInput(**vars(given), values=values))
+            off, value = (e.download(each, grid_shape(lens)) for each in (apart, handed))
+            own = value if isinstance(one, DepthImage) else e.download(values, grid_shape(lens))
+            return SeenFrom(near.z, near.free, _known(off), _known(own), value > 1.5 * _UNKNOWN)
 
     def intensity(self, ref: Reference, color: ColorImage | None, brightness: FloatArray, spline: Spline) -> Any:
         """A colour image's intensities less those expected at the keyframe's grid, on the device; without one unknown.
@@ -232,47 +223,32 @@ class FreeSpace:
                 return e.upload(np.full(grid_shape(ref.lens), _UNKNOWN))
             points, own_level = ref.points[level], color.level(pyramid_level(level))
             kernel = self._kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
-            to_base, _ = self._lines(ref, spline)
-            from_base = e.upload(from_base_table(spline, ref.T_world_base, color.exposure))
-            given = points.x, points.y, points.z, points.intensity, to_base, color.levels[own_level], from_base
+            seen_at = to_base(e, spline, ref.T_world_base, ref.rolling)
+            seen_from = from_base(e, spline, ref.T_world_base, color.exposure)
+            given = points.x, points.y, points.z, points.intensity, seen_at, color.levels[own_level], seen_from
             return kernel(IntensityInput(*given, e.upload(brightness)))
 
-    def _of_ref(self, ref: Reference, depth: DepthImage, spline: Spline) -> SpaceInput:
-        from_base = self.device.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
-        to_base, _ = self._lines(ref, spline)
-        return SpaceInput(ref.inverse_depth, *self.device.device_rays, to_base, depth.inverse_z, from_base)
-
-    def _of_frame(self, depth: DepthImage, ref: Reference, spline: Spline) -> SpaceInput:
-        to_base = self.device.e.upload(to_base_table(spline, ref.T_world_base, depth.exposure))
-        _, from_base = self._lines(ref, spline)
-        return SpaceInput(depth.inverse_z, *self.device.device_rays, to_base, ref.inverse_depth, from_base)
-
-    def _lines(self, ref: Reference, spline: Spline) -> tuple[Any, Any]:
+    def _given(self, one: Reference | DepthImage, other: Reference | DepthImage, spline: Spline) -> SpaceInput:
         e = self.device.e
-        if ref.rolling is None:
-            return e.upload(_IDENTITY_TO_BASE), e.upload(IDENTITY_FROM_BASE)
-        return (
-            e.upload(to_base_table(spline, ref.T_world_base, ref.rolling)),
-            e.upload(from_base_table(spline, ref.T_world_base, ref.rolling)),
+        ref = one if isinstance(one, Reference) else other
+        T = ref.T_world_base if isinstance(ref, Reference) else spline.pose(ref.exposure.mid_time)
+        (rho, moved), (there, seen) = (
+            (image.inverse_depth, image.rolling) if isinstance(image, Reference) else (image.inverse_z, image.exposure)
+            for image in (one, other)
         )
+        poses = to_base(e, spline, T, moved), from_base(e, spline, T, seen)
+        return SpaceInput(rho, *self.device.device_rays, poses[0], there, poses[1])
 
-    def _free(self, lens: Lens, other: Lens, has_rays: bool, given: SpaceInput) -> Free:
-        kernel = self._kernel(free_space_kernel, lens, other, grid_of(lens)[1], has_rays)
+    def _free(self, one: Reference | DepthImage, other: Reference | DepthImage, given: SpaceInput) -> Free:
+        lens, has_rays = _lens(one), isinstance(one, DepthImage) or one.rolling is not None
+        kernel = self._kernel(free_space_kernel, lens, _lens(other), grid_of(lens)[1], has_rays)
         rho, free = (self.device.e.download(values, grid_shape(lens)) for values in kernel(given))
         z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
         return Free(z, _known(free))
 
-    def _seen(
-        self, lens: Lens, other: Lens, has_rays: bool, given: SpaceInput, intensity: Any, is_handed: bool
-    ) -> Seen:
-        """is_handed: whether the intensities are the other image's."""
-        e, shape = self.device.e, grid_shape(lens)
-        near = self._free(lens, other, has_rays, given)
-        kernel = self._kernel(meeting_kernel, lens, other, grid_of(lens)[1], has_rays)
-        apart, handed = kernel(MeetingInput(**vars(given), values=intensity))
-        off, value = (e.download(values, shape) for values in (apart, handed))
-        own = value if is_handed else e.download(intensity, shape)
-        return Seen(near.z, near.free, _known(off), _known(own), value > 1.5 * _UNKNOWN)
+
+def _lens(image: Reference | DepthImage) -> Lens:
+    return image.lens if isinstance(image, Reference) else image.exposure.lens
 
 
 def grid_of(lens: Lens) -> tuple[int, int]:

@@ -40,7 +40,7 @@ from rstrack.alignment.weights import (
     scale_step,
 )
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
-from rstrack.images.line_poses import IDENTITY_FROM_BASE, Exposure, from_base_table, prepare, to_base_table
+from rstrack.images.line_poses import Exposure, from_base, prepare, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Points, Reference, pyramid_level, strides
 from rstrack.options import Options
@@ -161,8 +161,7 @@ class Terms:
         """
         e, lens, shifts, floor = self.e, image.exposure.lens, self.depth_image > 0.0, self._floor_depth(image, ref)
         with self.timer(f"geometric kernel, level {level}"):
-            to_base = self._to_base(spline, ref.T_world_base, image.exposure)
-            from_base = self._seen_from(spline, ref)
+            poses = self._to_base(spline, ref, image.exposure), self._from_base(spline, ref, ref.rolling)
             stride = _stride(lens, level)
             kernel = self._kernel(geometric_kernel, lens, ref.lens, stride, shifts)
             scaling = self._scaling(ref, lens, lens.camera, ref, stride, 1)
@@ -174,7 +173,7 @@ class Terms:
             rough = min(1.0, larger - 1.0) if self.counts_rough else 0.0
             constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, rough]))
             surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
-            raw = kernel(GeometricInput(image.z, *self.rays, to_base, *surface, from_base, constants))
+            raw = kernel(GeometricInput(image.z, *self.rays, poses[0], *surface, poses[1], constants))
         slopes = self._slopes(slopes_at or spline, image.exposure, ref)
 
         def finish() -> Linearised:
@@ -192,8 +191,8 @@ class Terms:
         """Which of the reference's points of a level the depth image does not hide: 1 or 0, on the device."""
         lens, points = depth.exposure.lens, ref.points[level]
         kernel = self._kernel(visibility_kernel, lens, ref.lens, _stride(ref.lens, level))
-        from_base = self._from_base(spline, ref.T_world_base, depth.exposure)
-        return kernel(VisibilityInput(points.x, points.y, points.z, self._ref_lines(spline, ref), depth.z, from_base))
+        seen_at, seen_from = self._to_base(spline, ref, ref.rolling), self._from_base(spline, ref, depth.exposure)
+        return kernel(VisibilityInput(points.x, points.y, points.z, seen_at, depth.z, seen_from))
 
     def photometric(
         self, image: ColorImage, ref: Reference, spline: Spline, level: int, sigma: float,
@@ -208,14 +207,12 @@ class Terms:
             e, lens, points = self.e, image.exposure.lens, ref.points[level]
             stride, own_level = _stride(ref.lens, level), image.level(pyramid_level(level))
             kernel = self._kernel(photometric_kernel, lens, ref.lens, stride, own_level, self.blur_sigma_px)
-            from_base = self._from_base(spline, ref.T_world_base, image.exposure)
+            seen_at, seen_from = self._to_base(spline, ref, ref.rolling), self._from_base(spline, ref, image.exposure)
             # Moving closer or turning packs more points into a block than its share.
             scaling = self._scaling(points, lens, ref.lens.camera, ref, stride, 4)
             constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
-            seen_at = self._ref_lines(spline, ref), image.levels[own_level], from_base
-            shown = points.visible if visible is None else visible
-            given = PhotometricInput(points.x, points.y, points.z, points.intensity, shown, *seen_at, constants)
-            raw = kernel(given)
+            at = points.x, points.y, points.z, points.intensity, points.visible if visible is None else visible
+            raw = kernel(PhotometricInput(*at, seen_at, image.levels[own_level], seen_from, constants))
         slopes = self._slopes(slopes_at or spline, image.exposure, ref)
 
         def finish() -> Linearised:
@@ -232,23 +229,13 @@ class Terms:
             ref_times = None if ref.rolling is None else ref.rolling.block_times(ref_per)
             return Slopes.of(spline, ref.T_world_base, _block_times(exposure, ref), ref_times)
 
-    def _to_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
+    def _to_base(self, spline: Spline, ref: Reference, exposure: Exposure | None) -> Any:
         with self.timer("poses of lines"):
-            return self.e.upload(to_base_table(spline, T_world_base, exposure))
+            return to_base(self.e, spline, ref.T_world_base, exposure)
 
-    def _from_base(self, spline: Spline, T_world_base: FloatArray, exposure: Exposure) -> Any:
+    def _from_base(self, spline: Spline, ref: Reference, exposure: Exposure | None) -> Any:
         with self.timer("poses of lines"):
-            return self.e.upload(from_base_table(spline, T_world_base, exposure))
-
-    def _ref_lines(self, spline: Spline, ref: Reference) -> Any:
-        if ref.rolling is None:
-            return self.e.upload(np.zeros(12))
-        return self._to_base(spline, ref.T_world_base, ref.rolling)
-
-    def _seen_from(self, spline: Spline, ref: Reference) -> Any:
-        if ref.rolling is None:
-            return self.e.upload(IDENTITY_FROM_BASE)
-        return self._from_base(spline, ref.T_world_base, ref.rolling)
+            return from_base(self.e, spline, ref.T_world_base, exposure)
 
     @staticmethod
     def _scaling(

@@ -7,10 +7,9 @@ Unknowns are left increments δ_i in se(3): T_i ← exp(δ_i) T_i in the world f
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy.linalg
@@ -19,6 +18,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
+from rstrack.images.line_poses import SplineCache
 
 
 @dataclass(frozen=True)
@@ -44,35 +44,31 @@ class Quadratic:
         return replace(self, g=self.g + self.H @ step) if step.any() else self
 
 
-def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:
-    """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
-    return _line_jacobian(spline, T_world_base.tobytes(), times.tobytes(), first, count)
-
-
-# Of a spline's last images: see `line_poses`.
-_REMEMBERED = 64
-_jacobians: WeakKeyDictionary[Spline, dict[bytes, tuple[IntArray, FloatArray]]] = WeakKeyDictionary()
+_jacobians: SplineCache[bytes, tuple[IntArray, FloatArray]] = SplineCache()
 
 
 def prepare_jacobians(spline: Spline, times: Iterable[FloatArray]) -> None:
-    """Work out what `line_jacobian` of several images' times (n,) needs at once: a call costs more than the numbers."""
-    known = _jacobians.setdefault(spline, {})
-    new = [t for t in {t.tobytes(): t for t in times}.values() if t.tobytes() not in known]
-    if not new:
-        return
-    first, J = spline.pose_jacobian(np.concatenate(new))
-    for oldest in list(known)[: max(0, len(known) + len(new) - _REMEMBERED)]:
-        del known[oldest]
-    ends = np.cumsum([len(t) for t in new])[:-1]
-    for t, segments, own in zip(new, np.split(first, ends), np.split(J, ends), strict=True):
-        known[t.tobytes()] = segments, own
+    """Work out what `line_jacobian` of several images' times (n,) needs at once."""
+
+    def work_out(new: list[bytes]) -> Iterator[tuple[IntArray, FloatArray]]:
+        given = [np.frombuffer(t) for t in new]
+        first, J = spline.pose_jacobian(np.concatenate(given))
+        ends = np.cumsum([len(t) for t in given])[:-1]
+        return zip(np.split(first, ends), np.split(J, ends), strict=True)
+
+    _jacobians.add(spline, (t.tobytes() for t in times), work_out)
+
+
+def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:
+    """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
+    return _line_jacobian(spline, T_world_base.tobytes(), times.tobytes(), first, count)
 
 
 @lru_cache(maxsize=64)
 def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int, count: int) -> FloatArray:
     """Remembered, because both terms and all iterations of a level ask for the same."""
     prepare_jacobians(spline, [np.frombuffer(times)])
-    at, J = _jacobians[spline][times]
+    at, J = _jacobians.of(spline)[times]
     J = se3.adjoint(se3.inverse(np.frombuffer(T_world_base).reshape(4, 4))) @ J
     return by_points(at, J, first, count)
 

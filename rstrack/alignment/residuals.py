@@ -26,7 +26,7 @@ from rsgen.device.arrays import Engine, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project_rolling
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import Contribution, Pixels, block_slot, contribution, sizes, summed
+from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.sampling import (
     EDGE,
@@ -90,7 +90,7 @@ def geometric_kernel(
     def kernel(given: GeometricInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
-        def at(pixels: Pixels) -> Contribution:
+        def at(pixels: PixelGrid) -> Contribution:
             z = dr.gather(e.Float, given.depth, pixels.index)
             active = pixels.meant & (z > 0.0)
             even = evened(z, parameters[2])
@@ -204,7 +204,7 @@ def photometric_kernel(
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
         gain, offset = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
 
-        def at(pixels: Pixels) -> Contribution:
+        def at(pixels: PixelGrid) -> Contribution:
             stored = given.x, given.y, given.z, given.intensity, given.visible
             x, y, z, intensity, visible = (dr.gather(e.Float, values, pixels.number) for values in stored)
             p: Vector = x, y, z

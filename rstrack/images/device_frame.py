@@ -108,23 +108,20 @@ class DeviceRig:
 
         Raises UserError if an image's size or type is not the rig's.
         """
-        with self.timer("preparing images"):
-            return self._upload(index, frame, color_late_s)
-
-    def _upload(self, index: int, frame: Frame, color_late_s: float) -> DeviceFrame:
         rig, options = self._rig, self._options
-        z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
-        if self.resolution == 0.0 and index < _SETTLED:
-            self.resolution = depth_resolution(z)
-        exposure = self._exposure(frame.depth, self.depth_lens, rig.depth_shutter, np.eye(4))
-        depth = depth_image(self.e, exposure, np.where(self._seen, z, 0.0), options.max_depth, self.resolution)
-        colors = []
-        for image in frame.colors if options.photometric else ():
-            pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
-            late = replace(image, stamp=image.stamp + color_late_s)
-            exposure = self._exposure(late, self.color_lens, rig.color_shutter, rig.T_color_depth)
-            colors.append(color_image(self.e, exposure, pixels, self._finer, self._evening))
-        return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size, color_late_s)
+        with self.timer("preparing images"):
+            z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
+            if self.resolution == 0.0 and index < _SETTLED:
+                self.resolution = depth_resolution(z)
+            exposure = self._exposure(frame.depth, self.depth_lens, rig.depth_shutter, np.eye(4))
+            depth = depth_image(self.e, exposure, np.where(self._seen, z, 0.0), options.max_depth, self.resolution)
+            colors = []
+            for image in frame.colors if options.photometric else ():
+                pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
+                late = replace(image, stamp=image.stamp + color_late_s)
+                exposure = self._exposure(late, self.color_lens, rig.color_shutter, rig.T_color_depth)
+                colors.append(color_image(self.e, exposure, pixels, self._finer, self._evening))
+            return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size, color_late_s)
 
     @staticmethod
     def _exposure(image: Image, lens: Lens, true: Shutter, T_cam_body: FloatArray) -> Exposure:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
@@ -17,6 +19,11 @@ from rsgen.geometry.spline import Spline
 
 # Evaluations of the spline that the poses of an image's lines are taken from: about every half of a millisecond.
 _NODES = 60
+# Of a spline's last images; a whole recording is mapped along one spline.
+REMEMBERED = 64
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -68,10 +75,12 @@ def _line_blocks(lens: Lens) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True)
-class _Motion:
+class _BlockMotion:
     """Poses T_world_body (n, 4, 4) at the blocks' middles, body twists (n, 6) there and their change per second.
 
-    A line dt from the middle is at T exp(twist dt + ½ rate dt²), to second order in dt.
+    A line dt from the middle is at T exp(twist dt + ½ rate dt²), to second order in dt: exact to nanometres over the
+    quarter of a millisecond to a block's edge. (A constant twist is wrong by a micrometre at 35 m/s², and its velocity
+    moves what project_rolling finds by 1e-3 px.)
     """
 
     T: FloatArray
@@ -91,28 +100,46 @@ def _algebra(twist: FloatArray) -> FloatArray:
     return out
 
 
-# Of a spline's last images, as long as the spline is there: both terms ask for the same. A whole recording is mapped
-# along one spline.
-_REMEMBERED = 64
-_motions: WeakKeyDictionary[Spline, dict[tuple[Lens, float], _Motion]] = WeakKeyDictionary()
+class SplineCache(Generic[Key, Value]):
+    """What was worked out of a spline for its last images, as long as the spline is there: all terms ask for the same.
+
+    Several images are worked out together, since a call costs more than the numbers do.
+    """
+
+    def __init__(self) -> None:
+        self._known: WeakKeyDictionary[Spline, dict[Key, Value]] = WeakKeyDictionary()
+
+    def of(self, spline: Spline) -> dict[Key, Value]:
+        """All that are there."""
+        return self._known.setdefault(spline, {})
+
+    def add(self, spline: Spline, keys: Iterable[Key], work_out: Callable[[list[Key]], Iterable[Value]]) -> None:
+        """Work out those that are not there yet, in place of the oldest."""
+        known = self.of(spline)
+        new = [key for key in dict.fromkeys(keys) if key not in known]
+        if new:
+            values = work_out(new)
+            for oldest in list(known)[: max(0, len(known) + len(new) - REMEMBERED)]:
+                del known[oldest]
+            known.update(zip(new, values, strict=True))
+
+
+_motions: SplineCache[tuple[Lens, float], _BlockMotion] = SplineCache()
 
 
 def prepare(spline: Spline, exposures: Iterable[Exposure]) -> None:
-    """Work out how the lines of several images move at once: a call costs more than the numbers do."""
-    known = _motions.setdefault(spline, {})
-    new = list(dict.fromkeys((x.lens, x.stamp) for x in exposures if (x.lens, x.stamp) not in known))
-    if not new:
-        return
-    middles = [_line_blocks(lens)[0] for lens, _ in new]
-    times = np.concatenate([stamp + middle for (_, stamp), middle in zip(new, middles, strict=True)])
-    T, twist = spline.pose_and_velocity(times)
-    for oldest in list(known)[: max(0, len(known) + len(new) - _REMEMBERED)]:
-        del known[oldest]
-    at = 0
-    for key, middle in zip(new, middles, strict=True):
-        own = slice(at, at + len(middle))
-        known[key] = _Motion(T[own], twist[own], _rate(middle, twist[own]))
-        at += len(middle)
+    """Work out how the lines of several images move at once."""
+
+    def work_out(new: list[tuple[Lens, float]]) -> Iterator[_BlockMotion]:
+        middles = [_line_blocks(lens)[0] for lens, _ in new]
+        T, twist = spline.pose_and_velocity(
+            np.concatenate([stamp + middle for (_, stamp), middle in zip(new, middles, strict=True)])
+        )
+        ends = np.cumsum([len(middle) for middle in middles])[:-1]
+        for middle, own_T, own in zip(middles, np.split(T, ends), np.split(twist, ends), strict=True):
+            yield _BlockMotion(own_T, own, _rate(middle, own))
+
+    _motions.add(spline, ((x.lens, x.stamp) for x in exposures), work_out)
 
 
 def _rate(middle: FloatArray, twist: FloatArray) -> FloatArray:
@@ -124,9 +151,9 @@ def _rate(middle: FloatArray, twist: FloatArray) -> FloatArray:
     return np.concatenate([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
 
 
-def _motion(spline: Spline, exposure: Exposure) -> _Motion:
+def _motion(spline: Spline, exposure: Exposure) -> _BlockMotion:
     prepare(spline, [exposure])
-    return _motions[spline][exposure.lens, exposure.stamp]
+    return _motions.of(spline)[exposure.lens, exposure.stamp]
 
 
 def _of_lines(lens: Lens, *powers: FloatArray) -> FloatArray:
@@ -138,19 +165,8 @@ def _of_lines(lens: Lens, *powers: FloatArray) -> FloatArray:
     return out.reshape(-1, out.shape[-1])[: lens.lines]
 
 
-def line_poses(spline: Spline, exposure: Exposure) -> FloatArray:
-    """T_world_body (lines, 4, 4), from the middle of each line's block.
-
-    With a twist that changes linearly: over the quarter of a millisecond to a block's edge that is exact to nanometres.
-    (A constant one is wrong by a micrometre at 35 m/s², and its velocity moves what project_rolling finds by 1e-3 px.)
-    """
-    motion = _motion(spline, exposure)
-    T = motion.T @ motion.powers(1.0)
-    return _of_lines(exposure.lens, *T.reshape(3, -1, 16)).reshape(-1, 4, 4)
-
-
 def line_twists(spline: Spline, exposure: Exposure) -> FloatArray:
-    """Body twists (lines, 6) likewise, in m/s and rad/s."""
+    """Body twists (lines, 6) in m/s and rad/s."""
     motion = _motion(spline, exposure)
     return _of_lines(exposure.lens, motion.twist, motion.rate)
 
@@ -177,4 +193,15 @@ def rows_of(T: FloatArray) -> FloatArray:
     return np.concatenate([T[..., :3, :3].reshape(*T.shape[:-2], 9), T[..., :3, 3]], axis=-1)
 
 
+IDENTITY_TO_BASE = np.append(np.eye(3).ravel(), np.zeros(3))
 IDENTITY_FROM_BASE = np.concatenate([np.eye(3).ravel(), np.zeros(9)])[None]
+
+
+def to_base(e: Engine, spline: Spline, T_world_base: FloatArray, exposure: Exposure | None) -> Any:
+    """`to_base_table` on the device; None: of an image that is rectified to the base frame."""
+    return e.upload(IDENTITY_TO_BASE if exposure is None else to_base_table(spline, T_world_base, exposure))
+
+
+def from_base(e: Engine, spline: Spline, T_world_base: FloatArray, exposure: Exposure | None) -> Any:
+    """`from_base_table` on the device, likewise."""
+    return e.upload(IDENTITY_FROM_BASE if exposure is None else from_base_table(spline, T_world_base, exposure))

@@ -29,7 +29,7 @@ _PIXEL_BYTES = 28
 # Normals come from a window of this many pixels; the residual itself is not smoothed.
 _NORMAL_WINDOW = 5
 
-Image = npt.NDArray[np.float32]
+FloatImage = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ class Reference:
     bound: float
     pixels: int
     moments: FloatArray
-    intensity: Image | None
-    depth_thumbnail: Image
-    color_thumbnail: Image | None
+    intensity: FloatImage | None
+    depth_thumbnail: FloatImage
+    color_thumbnail: FloatImage | None
     brightness: FloatArray = field(default_factory=lambda: np.zeros(2))
-    coarse_intensity: Image | None = None
+    coarse_intensity: FloatImage | None = None
 
     def emptied(self) -> Reference:
         """Without what is on the device, and can be made again."""
@@ -114,7 +114,7 @@ def strides(width: int, height: int) -> tuple[int, ...]:
     return *(finest * 2**level for level in range(LEVELS)), 2 * finest
 
 
-def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
+def surface_slopes(rho: FloatImage, fx: float, fy: float) -> tuple[FloatImage, FloatImage]:
     """Derivatives of inverse depth (h, w) by normalised coordinates, averaged over a window without crossing edges."""
     out = []
     for axis, focal in ((1, fx), (0, fy)):
@@ -133,7 +133,7 @@ def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
     return out[0], out[1]
 
 
-def surface_bends(slope_x: Image, slope_y: Image, fx: float, fy: float) -> tuple[Image, Image]:
+def surface_bends(slope_x: FloatImage, slope_y: FloatImage, fx: float, fy: float) -> tuple[FloatImage, FloatImage]:
     """Size of the second differences (h, w) of inverse depth from pixel to pixel, along rows and columns."""
     bend_x, bend_y = np.zeros_like(slope_x), np.zeros_like(slope_y)
     bend_x[:, 1:-1] = np.abs(slope_x[:, 2:] - slope_x[:, :-2]) / np.float32(2.0 * fx)
@@ -141,7 +141,7 @@ def surface_bends(slope_x: Image, slope_y: Image, fx: float, fy: float) -> tuple
     return bend_x, bend_y
 
 
-def surface_roughness(rho: Image, slope_x: Image, slope_y: Image, fx: float, fy: float) -> Image:
+def surface_roughness(rho: FloatImage, slope_x: FloatImage, slope_y: FloatImage, fx: float, fy: float) -> FloatImage:
     """Error (h, w) in m that bilinear interpolation of inverse depth may have: an eighth of its second difference.
 
     Where walls meet, the chord cuts the corner, always towards the camera: small, but it adds up from keyframe to
@@ -153,7 +153,7 @@ def surface_roughness(rho: Image, slope_x: Image, slope_y: Image, fx: float, fy:
     return (_NORMAL_WINDOW / 8.0 * z * z * np.maximum(bend_x, bend_y)).astype(np.float32)
 
 
-def on_one_surface(rho: Image) -> npt.NDArray[np.bool_]:
+def on_one_surface(rho: FloatImage) -> npt.NDArray[np.bool_]:
     """Pixels (h, w) with depth whose neighbours right, left, above and below do not lie across an edge."""
     valid = rho > 0
     for axis in (0, 1):
@@ -173,7 +173,7 @@ def pyramid_level(sampling: int) -> int:
     return 0 if sampling == THINNED else sampling
 
 
-def depth_scaling(rho: Image) -> tuple[float, float]:
+def depth_scaling(rho: FloatImage) -> tuple[float, float]:
     """`median_depth` and `bound` of the geometric term.
 
     |j| is 1 for shifts and z / median_depth for rotations, times the kernel's min((median_depth / z)², NEAREST): never
@@ -184,7 +184,7 @@ def depth_scaling(rho: Image) -> tuple[float, float]:
 
 
 def level_points(
-    e: Engine, rho: Image, rays: FloatArray, intensity: Image, coarse: Image | None = None
+    e: Engine, rho: FloatImage, rays: FloatArray, intensity: FloatImage, coarse: FloatImage | None = None
 ) -> tuple[Points, ...]:
     """Points of all levels, and of `THINNED`.
 
@@ -215,6 +215,6 @@ def level_points(
     return tuple(out)
 
 
-def _intensities(intensity: Image, rho: Image) -> list[tuple[Image, npt.NDArray[np.bool_]]]:
+def _intensities(intensity: FloatImage, rho: FloatImage) -> list[tuple[FloatImage, npt.NDArray[np.bool_]]]:
     known = np.isfinite(intensity)
     return masked_pyramid(np.where(known, intensity, np.float32(0.0)), known & (rho > 0))

@@ -15,11 +15,11 @@ from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.device_frame import MARGIN, DeviceRig, Timer, thumbnail_without, untimed
-from rstrack.images.line_poses import from_base_table, to_base_table
+from rstrack.images.line_poses import from_base, rows_of, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage, thumbnail
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import (
-    Image,
+    FloatImage,
     Points,
     Reference,
     depth_scaling,
@@ -60,14 +60,9 @@ class KeyframeMaker:
     def rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
         """A reference that keeps its rolling shutter, for the time until it can be rectified."""
         with self.timer("keyframes: make"):
-            return self._rolling(index, depth, colors, spline)
-
-    def _rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
-        lens = depth.exposure.lens
-        shape = lens.camera.height, lens.camera.width
-        t = depth.exposure.mid_time
-        rho = self.e.download(depth.inverse_z, shape)
-        return self._finish(index, depth, colors, spline, t, spline.pose(t), lens, depth.inverse_z, rho, None)
+            lens, t = depth.exposure.lens, depth.exposure.mid_time
+            rho = self.e.download(depth.inverse_z, (lens.camera.height, lens.camera.width))
+            return self._finish(index, depth, colors, spline, t, spline.pose(t), lens, depth.inverse_z, rho, None)
 
     def rectified(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None,
@@ -77,49 +72,42 @@ class KeyframeMaker:
 
         Where something moves before it, it has the older one's intensities, times the first of as_now plus the second.
         """
+        e, t = self.e, depth.exposure.mid_time
         with self.timer("keyframes: make"):
-            return self._rectified(index, depth, colors, spline, older, as_now)
-
-    def _rectified(
-        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None,
-        as_now: tuple[float, float],
-    ) -> Reference:  # fmt: skip
-        e = self.e
-        t = depth.exposure.mid_time
-        T_world_base, base, rho = self.rectify(depth, spline)
-        shape = base.camera.height, base.camera.width
-        host = e.download(rho, shape)
-        if older is None or older.rolling is not None:
-            return self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
-        # Its colours are looked up once its depth is known.
-        made = self._finish(index, depth, (), spline, t, T_world_base, base, rho, host, None)
-        T = se3.inverse(older.T_world_base) @ T_world_base
-        from_base = e.upload(np.concatenate([T[:3, :3].ravel(), T[:3, 3], np.zeros(6)]))
-        rho, weight = self._fuse(made, older.lens, older.inverse_depth, older.weight, from_base)
-        back = se3.inverse(T)
-        to_base = e.upload(np.concatenate([back[:3, :3].ravel(), back[:3, 3]]))
-        _, grid = self._pinhole_rays(base)
-        old, *at = self._kernel(rectify_kernel, older.lens, base)(older.inverse_depth, *grid, to_base)
-        host, old_host = e.download(rho, shape), e.download(old, shape)
-        holes = (host <= 0) & (old_host > 0)
-        host = np.where(holes, old_host, host)
-        weights = np.where(holes, 1.0, e.download(weight, shape))
-        inherited = None
-        if depth.whole is not None and older.intensity is not None:
-            same = (old_host > 0) & (np.abs(old_host - host) < EDGE * host)
-            x, y = (e.download(values, shape) for values in at)
-            inherited = np.float32(as_now[0]) * _looked_up(older.intensity, x, y, same) + np.float32(as_now[1])
-        return self._finish(
-            index, depth, colors, spline, t, T_world_base, base, e.upload(host), host, weights, inherited
-        )
+            T_world_base, base, rho = self.rectify(depth, spline)
+            shape = base.camera.height, base.camera.width
+            host = e.download(rho, shape)
+            if older is None or older.rolling is not None:
+                return self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
+            # Its colours are looked up once its depth is known.
+            made = self._finish(index, depth, (), spline, t, T_world_base, base, rho, host, None)
+            T = se3.inverse(older.T_world_base) @ T_world_base
+            seen_from = e.upload(np.concatenate([rows_of(T), np.zeros(6)]))
+            rho, weight = self._fuse(made, older.lens, older.inverse_depth, older.weight, seen_from)
+            _, grid = self._pinhole_rays(base)
+            rectify = self._kernel(rectify_kernel, older.lens, base)
+            old, *at = rectify(older.inverse_depth, *grid, e.upload(rows_of(se3.inverse(T))))
+            host, old_host = e.download(rho, shape), e.download(old, shape)
+            holes = (host <= 0) & (old_host > 0)
+            host = np.where(holes, old_host, host)
+            weights = np.where(holes, 1.0, e.download(weight, shape))
+            inherited = None
+            if depth.whole is not None and older.intensity is not None:
+                same = (old_host > 0) & (np.abs(old_host - host) < EDGE * host)
+                x, y = (e.download(values, shape) for values in at)
+                inherited = np.float32(as_now[0]) * _looked_up(older.intensity, x, y, same) + np.float32(as_now[1])
+            on_device = e.upload(host)
+            return self._finish(
+                index, depth, colors, spline, t, T_world_base, base, on_device, host, weights, inherited
+            )
 
     def rectify(self, depth: DepthImage, spline: Spline) -> tuple[FloatArray, Lens, Any]:
         """T_world_base (4, 4) at mid readout, the lens, and inverse depth as seen from there at once, on the device."""
         lens = depth.exposure.lens
         base = rectified_lens(lens.camera)
         T_world_base: FloatArray = spline.pose(depth.exposure.mid_time)
-        to_base = self.e.upload(to_base_table(spline, T_world_base, depth.exposure))
-        rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, to_base)
+        seen_at = to_base(self.e, spline, T_world_base, depth.exposure)
+        rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, seen_at)
         return T_world_base, base, rho
 
     def _hidden(self, depth: DepthImage, whole: DepthImage, spline: Spline) -> npt.NDArray[np.bool_]:
@@ -134,7 +122,7 @@ class KeyframeMaker:
         return np.asarray(cv2.dilate((all_ & ~rest).astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0)
 
     def with_depth(
-        self, made: Reference, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, rho: Image,
+        self, made: Reference, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, rho: FloatImage,
         weight: npt.NDArray[Any],
     ) -> Reference:  # fmt: skip
         """A keyframe that `rectified` made of these images, with other inverse depth and weights (h, w)."""
@@ -149,20 +137,16 @@ class KeyframeMaker:
         most: weight of a pixel in measurements beyond which the oldest count ever less.
         """
         with self.timer("keyframes: fuse"):
-            from_base = self.e.upload(from_base_table(spline, ref.T_world_base, depth.exposure))
-            rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), from_base, most)
+            seen_from = from_base(self.e, spline, ref.T_world_base, depth.exposure)
+            rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), seen_from, most)
         return replace(ref, inverse_depth=rho, weight=weight)
 
     def _fuse(
-        self, ref: Reference, lens: Lens, source: Any, source_weight: Any, from_base: Any, most: float = _MOST
+        self, ref: Reference, lens: Lens, source: Any, source_weight: Any, seen_from: Any, most: float = _MOST
     ) -> tuple[Any, Any]:
-        constants = self.e.upload(np.array([_AGREE, most]))
-        kernel = self._kernel(fuse_kernel, lens, ref.lens)
-        fused: tuple[Any, Any] = kernel(
-            FusionInput(
-                ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y, source, source_weight, from_base, constants
-            )
-        )
+        own = ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y
+        given = FusionInput(*own, source, source_weight, seen_from, self.e.upload(np.array([_AGREE, most])))
+        fused: tuple[Any, Any] = self._kernel(fuse_kernel, lens, ref.lens)(given)
         return fused
 
     def _ones(self, depth: DepthImage) -> Any:
@@ -178,14 +162,14 @@ class KeyframeMaker:
             self._rays = rays, (self.e.upload(rays[..., 0]), self.e.upload(rays[..., 1]))
         return self._rays
 
-    def revived(self, small: Reference, rho: Image, weight: npt.NDArray[Any]) -> Reference:
+    def revived(self, small: Reference, rho: FloatImage, weight: npt.NDArray[Any]) -> Reference:
         """A rectified keyframe from what `Reference.emptied` left of it, its inverse depth and its weight (h, w)."""
         return self._with_surface(small, self.e.upload(rho), rho, weight)
 
     def _finish(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
-        T_world_base: FloatArray, lens: Lens, device_rho: Any, rho: Image, weight: npt.NDArray[Any] | None,
-        inherited: Image | None = None,
+        T_world_base: FloatArray, lens: Lens, device_rho: Any, rho: FloatImage, weight: npt.NDArray[Any] | None,
+        inherited: FloatImage | None = None,
     ) -> Reference:  # fmt: skip
         """inherited (h, w): intensities of what rests, NaN where they are not known, for where something moves."""
         e = self.e
@@ -195,12 +179,12 @@ class KeyframeMaker:
             color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
             moments, color_thumbnail = color.moments, thumbnail_without(color, depth)
             _, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
-            to_base = e.upload(to_base_table(spline, T_world_base, rolling) if rolling else np.zeros(12))
-            from_base = e.upload(from_base_table(spline, T_world_base, color.exposure))
+            seen_at = to_base(e, spline, T_world_base, rolling)
+            seen_from = from_base(e, spline, T_world_base, color.exposure)
 
-            def look_up(level: int) -> Image:
+            def look_up(level: int) -> FloatImage:
                 kernel = self._kernel(color_kernel, color.exposure.lens, lens, level)
-                value, seen = kernel(ColorInput(device_rho, *grid, to_base, color.levels[level], from_base))
+                value, seen = kernel(ColorInput(device_rho, *grid, seen_at, color.levels[level], seen_from))
                 known = e.download(seen, rho.shape) > 0
                 return np.where(known, e.download(value, rho.shape), np.nan).astype(np.float32)
 
@@ -218,7 +202,7 @@ class KeyframeMaker:
         )  # fmt: skip
         return self._with_surface(small, device_rho, rho, np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
 
-    def _with_surface(self, small: Reference, device_rho: Any, rho: Image, weight: npt.NDArray[Any]) -> Reference:
+    def _with_surface(self, small: Reference, device_rho: Any, rho: FloatImage, weight: npt.NDArray[Any]) -> Reference:
         e, camera = self.e, small.lens.camera
         rays = self.rays if small.rolling else self._pinhole_rays(small.lens)[0]
         slope_x, slope_y = surface_slopes(rho, camera.fx, camera.fy)
@@ -234,7 +218,7 @@ class KeyframeMaker:
         )  # fmt: skip
 
 
-def _looked_up(image: Image, x: Image, y: Image, known: npt.NDArray[np.bool_]) -> Image:
+def _looked_up(image: FloatImage, x: FloatImage, y: FloatImage, known: npt.NDArray[np.bool_]) -> FloatImage:
     """An image (h, w) at its pixels x, y (h, w); NaN where these are not known."""
     at = np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan))
     return np.where(known, at, np.float32(np.nan))

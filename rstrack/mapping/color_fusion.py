@@ -27,7 +27,7 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import RollingProjection, cross, gather, move, project, project_rolling
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.images.line_poses import Exposure, from_base_table, line_twists
+from rstrack.images.line_poses import Exposure, from_base, line_twists, rows_of
 from rstrack.images.pyramid import DepthImage
 from rstrack.images.sampling import EDGE, bilinear, blur_weight, grid
 from rstrack.keyframes.keyframe import Reference
@@ -101,9 +101,9 @@ class ColorFusion:
         e = self.e
         kernel = self._kernel(_add_kernel, image.exposure.lens, depth.exposure.lens, ref.lens)
         tables = (
-            e.upload(from_base_table(spline, ref.T_world_base, image.exposure)),
+            from_base(e, spline, ref.T_world_base, image.exposure),
             e.upload(sweep_table(spline, image.exposure)),
-            e.upload(from_base_table(spline, ref.T_world_base, depth.exposure)),
+            from_base(e, spline, ref.T_world_base, depth.exposure),
         )
         inv_sigma2 = 0.0 if self.sigma_px is None else self.sigma_px**-2
         constants = e.upload(np.array([inv_sigma2, _LEAST, _MOST]))
@@ -115,7 +115,7 @@ class ColorFusion:
     def inherit(self, ref: Reference, older: FusedColor, older_ref: Reference) -> FusedColor:
         """What an older keyframe knows of the colours of a new one, with its weights."""
         T_old_new = se3.inverse(older_ref.T_world_base) @ ref.T_world_base
-        pose = self.e.upload(np.concatenate([T_old_new[:3, :3].ravel(), T_old_new[:3, 3]]))
+        pose = self.e.upload(rows_of(T_old_new))
         kernel = self._kernel(_inherit_kernel, older_ref.lens, ref.lens)
         *rgb, weight = kernel(ref.inverse_depth, *older.rgb, older.weight, older_ref.inverse_depth, pose)
         camera = ref.lens.camera

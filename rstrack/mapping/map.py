@@ -27,7 +27,7 @@ from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import MARGIN
-from rstrack.images.line_poses import Exposure, from_base_table, to_base_table
+from rstrack.images.line_poses import IDENTITY_TO_BASE, Exposure, from_base_table, rows_of, to_base_table
 from rstrack.images.pyramid import camera_rays, depth_image, lens_sees
 from rstrack.images.sampling import bilinear, grid
 from rstrack.keyframes.keyframe import rectified_lens
@@ -95,12 +95,11 @@ class FrameMapper:
         depth = depth_image(e, exposure, z if moving is None else np.where(moving, 0.0, z), self._max_depth)
         if self._rolling:
             assert self._estimate.spline is not None
-            to_base = to_base_table(self._estimate.spline, T_estimate_base, exposure)
+            seen_at = to_base_table(self._estimate.spline, T_estimate_base, exposure)
         else:
-            to_base = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
-        rho, _, _ = self._kernel(rectify_kernel, self._depth_lens, self.base)(
-            depth.inverse_z, *self._rays, e.upload(to_base)
-        )
+            seen_at = IDENTITY_TO_BASE
+        rectify = self._kernel(rectify_kernel, self._depth_lens, self.base)
+        rho, _, _ = rectify(depth.inverse_z, *self._rays, e.upload(seen_at))
         self._volume.integrate(
             rho, self._T_world_estimate @ T_estimate_base, self.base, color=self._colors(frame, rho, T_estimate_base, t)
         )
@@ -122,7 +121,7 @@ class FrameMapper:
             from_base = from_base_table(self._estimate.spline, T_estimate_base, exposure)
         else:
             T = self._rig.T_color_depth @ se3.inverse(self._pose(exposure.mid_time)) @ T_estimate_base
-            from_base = np.concatenate([T[:3, :3].ravel(), T[:3, 3], np.zeros(6)])
+            from_base = np.concatenate([rows_of(T), np.zeros(6)])
         planes = [e.upload(plane / np.float32(255.0)) for plane in np.moveaxis(frame.colors[best].pixels, -1, 0)]
         out: list[Any] = self._kernel(_lookup_kernel, self._color_lens, self.base)(rho, *planes, e.upload(from_base))
         return out

@@ -19,7 +19,7 @@ import drjit as dr
 from rsgen.device.arrays import Engine, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
-from rstrack.alignment.block_sums import Contribution, Pixels, block_slot, contribution, sizes, summed
+from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
@@ -74,7 +74,7 @@ class Point:
     active: Any
 
 
-def _points(e: Engine, depth: Lens, pixels: Pixels, asked: Asked, given: DepthPairInput | ColorPairInput) -> Point:
+def _points(e: Engine, depth: Lens, pixels: PixelGrid, asked: Asked, given: DepthPairInput | ColorPairInput) -> Point:
     """Of pixels of a depth image."""
     images = given.depth, given.rays_x, given.rays_y
     z, xn, yn = (dr.gather(e.Float, image, pixels.index) for image in images)
@@ -103,7 +103,7 @@ class DepthResidual:
     is_smooth: Any
 
 
-def depth_residual(e: Engine, depth: Lens, pixels: Pixels, asked: Asked, given: DepthPairInput) -> DepthResidual:
+def depth_residual(e: Engine, depth: Lens, pixels: PixelGrid, asked: Asked, given: DepthPairInput) -> DepthResidual:
     """Equation (6) with rows' times on both sides."""
     lens = traced(e, depth, given.camera)
     at = _points(e, depth, pixels, asked, given)
@@ -138,7 +138,7 @@ class ColorResidual:
 
 
 def color_residual(
-    e: Engine, color: Lens, depth: Lens, pixels: Pixels, level: int, asked: Asked, given: ColorPairInput
+    e: Engine, color: Lens, depth: Lens, pixels: PixelGrid, level: int, asked: Asked, given: ColorPairInput
 ) -> ColorResidual:
     """Intensities of the level, the reference's with the gain and offset that the current image has."""
     width, height = level_size(color.camera.width, level), level_size(color.camera.height, level)
@@ -169,7 +169,7 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked) -> Call
     def kernel(given: DepthPairInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
-        def at(pixels: Pixels) -> Contribution:
+        def at(pixels: PixelGrid) -> Contribution:
             of = depth_residual(e, depth, pixels, asked, given)
             point, seen, columns = of.at, of.seen, []
             if names:
@@ -199,7 +199,7 @@ def color_pair_kernel(
     def kernel(given: ColorPairInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
-        def at(pixels: Pixels) -> Contribution:
+        def at(pixels: PixelGrid) -> Contribution:
             of = color_residual(e, color, depth, pixels, level, asked, given)
             here, there, columns = of.here, of.there, []
             a, b, c = (0.5 * dr.fma(1.0 + of.gain, two, one) for one, two in zip(of.own, of.other, strict=True))
@@ -216,7 +216,9 @@ def color_pair_kernel(
     return kernel
 
 
-def _summed(e: Engine, depth: Lens, lens: Lens, stride: int, columns: int, at: Callable[[Pixels], Contribution]) -> Any:
+def _summed(
+    e: Engine, depth: Lens, lens: Lens, stride: int, columns: int, at: Callable[[PixelGrid], Contribution]
+) -> Any:
     """Sums over a depth image's pixels, in blocks of a lens's lines."""
     shape = depth.camera.width, depth.camera.height, stride
     return summed(e, shape, sizes(lens, lens, columns), at, not lens.shutter.by_rows, False)

@@ -17,7 +17,7 @@ import scipy.linalg
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.alignment.block_sums import Pixels, Scaling, every
+from rstrack.alignment.block_sums import PixelGrid, Scaling, every
 from rstrack.alignment.brightness import SAME
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
 from rstrack.calibration.pairs.images import DepthSurface, LinePoses, lines_of
@@ -86,7 +86,7 @@ def _by_color(
     return _twists(of.p, of.own, of.other, of.active & (abs(of.r) < GATE_INTENSITY), sigma)
 
 
-def _pixels(terms: PairTerms) -> Pixels:
+def _pixels(terms: PairTerms) -> PixelGrid:
     camera = terms.depth.camera
     return every(terms.e, camera.width, camera.height, terms.stride)
 

@@ -17,7 +17,7 @@ import numpy as np
 from rsgen.device.arrays import Engine
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.free_space import Free, FreeSpace, Grid, Seen, grid_of
+from rstrack.alignment.free_space import Free, FreeSpace, Grid, SeenFrom, grid_of
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH
@@ -40,7 +40,7 @@ _BEYOND_STEPS, _LEAST_SHARE = 6, 0.1
 _MARGIN = 1
 
 
-def moving(seen: Seen, sigma_depth: float, median_depth: float, sigma_intensity: float) -> Mask:
+def moving(seen: SeenFrom, sigma_depth: float, median_depth: float, sigma_intensity: float) -> Mask:
     """Pixels (gh, gw) of things that have moved: in free space, or on one surface with such that are.
 
     sigma_depth (m): scale of depth's residuals at median_depth (m), growing with the square of depth; sigma_intensity:
@@ -69,14 +69,14 @@ def _is_enough(seeds: Mask) -> bool:
     return bool(np.count_nonzero(seeds) >= _LEAST * seeds.size)
 
 
-def untold(seen: Seen, sigma_depth: float, median_depth: float) -> Mask:
+def untold(seen: SeenFrom, sigma_depth: float, median_depth: float) -> Mask:
     """Pixels (gh, gw) of which the other image says nothing: they fall into its holes, beyond it, or behind what it
     shows."""
     _, least = _scales(seen.z, sigma_depth, median_depth)
     return np.asarray(np.isfinite(seen.z) & ~(seen.apart >= -least))
 
 
-def moving_with(seen: Seen, left_out: Mask, sigma_depth: float, median_depth: float) -> Mask:
+def moving_with(seen: SeenFrom, left_out: Mask, sigma_depth: float, median_depth: float) -> Mask:
     """Pixels (gh, gw) of things that the other image shows about there and does without.
 
     left_out (gh, gw): pixels that fall where something has been left out of it.
@@ -212,17 +212,17 @@ def _found(
     def differences() -> Any:
         return space.intensity(ref, image, brightness, state.spline)
 
-    gone = _moving(space, space.before_frame(ref, depth.occluder, state.spline), scales, sigma_intensity,
-                   lambda: space.keyframe_in_frame(ref, depth.occluder, differences(), state.spline))  # fmt: skip
+    gone = _moving(space, space.before(ref, depth.occluder, state.spline), scales, sigma_intensity,
+                   lambda: space.seen_from(ref, depth.occluder, differences(), state.spline))  # fmt: skip
     if gone is None:
         return nothing
     # What falls where something is gone may be that in another place.
     rest = without(e, ref, gone) if gone.any() else ref
 
-    def look() -> Seen:
-        return space.frame_in_keyframe(depth.occluder, rest, differences(), state.spline)
+    def look() -> SeenFrom:
+        return space.seen_from(depth.occluder, rest, differences(), state.spline)
 
-    came = _moving(space, space.before_keyframe(depth.occluder, rest, state.spline), scales, sigma_intensity, look)
+    came = _moving(space, space.before(depth.occluder, rest, state.spline), scales, sigma_intensity, look)
     if came is None:
         return nothing
     if color is None and before is not None and before.left_out is not None:
@@ -236,7 +236,7 @@ def _found(
 
 
 def _moving(
-    space: FreeSpace, near: Free, scales: tuple[float, float], sigma_intensity: float, look: Callable[[], Seen]
+    space: FreeSpace, near: Free, scales: tuple[float, float], sigma_intensity: float, look: Callable[[], SeenFrom]
 ) -> Mask | None:
     """Pixels of what moves, None where so much seems to that the pose is wrong. look: closer, where something may move.
 
@@ -256,7 +256,8 @@ def _as_before(
 ) -> Mask:
     """Pixels (gh, gw) of a frame that show, at about the same place, what has been left out of another one."""
     assert other.left_out is not None
-    seen = space.frame_in_frame(depth.occluder, other.occluder, other.left_out.astype(np.float32), spline)
+    left_out = space.device.e.upload(other.left_out.astype(np.float32))
+    seen = space.seen_from(depth.occluder, other.occluder, left_out, spline)
     with space.device.timer("what moves: regions"):
         return moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, *scales)
 

@@ -23,7 +23,7 @@ from rstrack.alignment.free_space import grid_shape
 from rstrack.images.device_frame import DeviceFrame, Mask
 from rstrack.images.pyramid import ColorImage
 from rstrack.images.sampling import EDGE
-from rstrack.keyframes.keyframe import Image, on_one_surface, surface_slopes
+from rstrack.keyframes.keyframe import FloatImage, on_one_surface, surface_slopes
 
 # Pixels over which inverse depth is averaged.
 _AVERAGED = 5
@@ -36,7 +36,7 @@ _HIDDEN_M = 0.15
 _TRIALS, _REFINED, _ROUNDS, _APART, _FOLLOWED, _SEED, _HOLD = 300, 12, 6, 4, 3, 0, 1e-3
 
 
-def averaged(rho: Image) -> Image:
+def averaged(rho: FloatImage) -> FloatImage:
     """Inverse depth (h, w; 0 missing) averaged over a few pixels that have it, but for edges."""
     size = (_AVERAGED, _AVERAGED)
     share = cv2.blur((rho > 0).astype(np.float32), size)
@@ -44,7 +44,7 @@ def averaged(rho: Image) -> Image:
     return np.where((rho > 0) & (np.abs(mean - rho) < EDGE * rho), mean, rho).astype(np.float32)
 
 
-def apart(points: FloatArray, images: Sequence[Image], rays: FloatArray, camera: Camera) -> FloatArray:
+def apart(points: FloatArray, images: Sequence[FloatImage], rays: FloatArray, camera: Camera) -> FloatArray:
     """How far (n,), in tolerances, points of a first image are off the last one's surface, NaN where hidden or unknown.
 
     points (n, 3): in the first image's camera frame, m. images: inverse depth (h, w) of those that follow; rays
@@ -74,7 +74,7 @@ def apart(points: FloatArray, images: Sequence[Image], rays: FloatArray, camera:
 
 
 def _equations(
-    points: FloatArray, T: FloatArray, rho: Image, slopes: tuple[Image, ...], rays: FloatArray, camera: Camera
+    points: FloatArray, T: FloatArray, rho: FloatImage, slopes: tuple[FloatImage, ...], rays: FloatArray, camera: Camera
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rows (n, 6) of increments exp(ξ) T, distances (n,) in front of the planes (m; NaN: none), and tolerances (n,)."""
     q = se3.transform(T, points)
@@ -158,7 +158,7 @@ def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) ->
     rho = e.download(first.inverse_z, shape)
     known = on_one_surface(rho)[pick]
 
-    def points(rho: Image) -> FloatArray:
+    def points(rho: FloatImage) -> FloatArray:
         z = 1.0 / rho[pick][known]
         return np.stack([rays[..., 0][pick][known] * z, rays[..., 1][pick][known] * z, z], axis=-1)
 

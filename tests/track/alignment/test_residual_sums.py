@@ -25,7 +25,7 @@ from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.alignment import block_sums as block_sums_module
 from rstrack.alignment import residuals
-from rstrack.alignment.block_sums import BlockSums, Contribution, Pixels, Scaling, block_counts
+from rstrack.alignment.block_sums import BlockSums, Contribution, PixelGrid, Scaling, block_counts
 from rstrack.alignment.normal_equations import Slopes, chain
 from rstrack.alignment.weights import LEAST_CURVATURE, NU, weight
 from rstrack.images import line_poses as lines
@@ -314,7 +314,7 @@ def test_runs_of_pixels_add_up_to_what_pixels_do(
     arrays = [ENGINE.UInt(2 * block.ravel()), *(ENGINE.Int(v.ravel()) for v in values), ENGINE.Bool(active.ravel())]
     seen = dr.zeros(ENGINE.Int, width * height)
 
-    def at(pixels: Pixels) -> Contribution:
+    def at(pixels: PixelGrid) -> Contribution:
         slot, a, b, is_active = (dr.gather(type(array), array, pixels.number) for array in arrays)
         compared = is_active & pixels.meant
         dr.scatter_add(seen, ENGINE.Int(1), pixels.y * width + pixels.x, pixels.meant & (pixels.index < len(seen)))

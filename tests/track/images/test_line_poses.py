@@ -18,7 +18,6 @@ from rstrack.images.line_poses import (
     IDENTITY_FROM_BASE,
     Exposure,
     from_base_table,
-    line_poses,
     line_twists,
     prepare,
     to_base_table,
@@ -34,6 +33,14 @@ def exposure(scan: Scan = "top-bottom", readout_s: float = 0.028, camera: Camera
 
 def rows_of(T: np.ndarray) -> np.ndarray:
     return np.array([*T[:3, :3].ravel(), *T[:3, 3]])
+
+
+def line_poses(spline: Spline, image: Exposure) -> np.ndarray:
+    """T_world_body (lines, 4, 4), by the table that kernels take."""
+    rows = to_base_table(spline, np.eye(4), image)
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
+    return np.asarray(T @ image.T_cam_body)
 
 
 @pytest.mark.parametrize("scan", SCANS)
@@ -83,17 +90,17 @@ def test_images_worked_out_together_are_as_each_is_alone() -> None:
     for image in images:
         for told in (line_poses, line_twists):
             np.testing.assert_allclose(told(spline, image), told(other, image), rtol=0, atol=1e-14)
-    assert spline is not other and len(lines._motions[spline]) == len(images)
+    assert spline is not other and len(lines._motions.of(spline)) == len(images)
 
 
 def test_a_whole_recording_along_one_spline_is_not_remembered() -> None:
     spline, image = hand_held(2), exposure()
     first = line_poses(spline, image)
-    assert (image.lens, image.stamp) in lines._motions[spline]
-    for k in range(3 * lines._REMEMBERED):
+    assert (image.lens, image.stamp) in lines._motions.of(spline)
+    for k in range(3 * lines.REMEMBERED):
         line_poses(spline, replace(image, stamp=STAMP + 1e-4 * (k + 1)))
-    assert len(lines._motions[spline]) == lines._REMEMBERED
-    assert (image.lens, image.stamp) not in lines._motions[spline]
+    assert len(lines._motions.of(spline)) == lines.REMEMBERED
+    assert (image.lens, image.stamp) not in lines._motions.of(spline)
     np.testing.assert_array_equal(line_poses(spline, image), first)
 
 

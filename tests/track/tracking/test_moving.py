@@ -24,7 +24,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import project_rolling
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.free_space import FreeSpace, Seen, grid_of
+from rstrack.alignment.free_space import FreeSpace, SeenFrom, grid_of
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
@@ -59,8 +59,8 @@ def test_free_space_is_what_rays_say(ref_scan: Literal["top-bottom"] | None) -> 
     shutter = at.lens.shutter
     space = FreeSpace(DeviceRig(Rig(camera, shutter, camera, shutter, np.eye(4)), Options(backend="llvm")))
     intensity = space.intensity(ref, None, np.zeros(2), truth)
-    in_frame = space.keyframe_in_frame(ref, depth, intensity, truth)
-    in_ref = space.frame_in_keyframe(depth, ref, intensity, truth)
+    in_frame = space.seen_from(ref, depth, intensity, truth)
+    in_ref = space.seen_from(depth, ref, intensity, truth)
     for seen, own, other, plane, sign in ((in_ref, at, ref_at, old, 1), (in_frame, ref_at, at, new, -1)):
         uv = camera.pixel_grid()
         T = truth.pose(own.lens.shutter.line_mid_time(own.stamp, own.lens.shutter.line_of_pixel(uv, camera), camera))
@@ -91,13 +91,13 @@ def test_only_every_stride_th_pixel_is_looked_at() -> None:
     intensity = space.intensity(ref, None, np.zeros(2), truth)
     for near, seen, rho in (
         (
-            space.before_keyframe(depth, ref, truth),
-            space.frame_in_keyframe(depth, ref, intensity, truth),
+            space.before(depth, ref, truth),
+            space.seen_from(depth, ref, intensity, truth),
             depth.inverse_z,
         ),
         (
-            space.before_frame(ref, depth, truth),
-            space.keyframe_in_frame(ref, depth, intensity, truth),
+            space.before(ref, depth, truth),
+            space.seen_from(ref, depth, intensity, truth),
             ref.inverse_depth,
         ),
     ):
@@ -110,7 +110,7 @@ def test_only_every_stride_th_pixel_is_looked_at() -> None:
 # -- regions ----------------------------------------------------------------------------------------------------------
 
 
-def still(seed: int = 0) -> Seen:
+def still(seed: int = 0) -> SeenFrom:
     """A wall 2 m away with 4 mm of noise, seen twice; its right quarter has not been seen before."""
     rng = np.random.default_rng(seed)
     apart = rng.normal(0.0, 4e-3, SHAPE).astype(np.float32)
@@ -118,10 +118,10 @@ def still(seed: int = 0) -> Seen:
     outside[:, 72:] = True
     apart[outside] = np.nan
     intensity = rng.normal(0.0, 0.01, SHAPE).astype(np.float32)
-    return Seen(np.full(SHAPE, 2.0, np.float32), apart.copy(), apart, intensity, outside)
+    return SeenFrom(np.full(SHAPE, 2.0, np.float32), apart.copy(), apart, intensity, outside)
 
 
-def regions(seen: Seen) -> Mask:
+def regions(seen: SeenFrom) -> Mask:
     return moving(seen, 4e-3, 2.0, 0.01)
 
 
