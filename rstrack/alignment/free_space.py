@@ -25,7 +25,17 @@ from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.device_frame import DeviceRig
 from rstrack.images.line_poses import from_base, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage
-from rstrack.images.sampling import bilinear, grid, level_size, nearest, surface
+from rstrack.images.sampling import (
+    bilinear_value,
+    depth_of,
+    grid,
+    level_size,
+    moved_to_base,
+    nearest,
+    pinhole_ray,
+    row_of_pixel,
+    surface,
+)
 from rstrack.keyframes.keyframe import Reference, pyramid_level, strides
 
 # What a kernel writes where it cannot tell: no metres, and no intensity, are as large.
@@ -61,13 +71,12 @@ def _moved(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool, give
     camera, there = lens.camera, other.camera
     index, px, py = grid(e, camera.width, camera.height, stride)
     rho = dr.gather(e.Float, given.inverse_depth, index)
-    known = rho > 0.0
-    z = dr.rcp(dr.select(known, rho, 1.0))
+    z, known = depth_of(rho)
     if has_rays:
         ray = dr.gather(e.Float, given.rays_x, index), dr.gather(e.Float, given.rays_y, index)
     else:
-        ray = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
-    line = e.UInt(0) if lens.lines == 1 else e.UInt(lens.line_of(e.Int(px), e.Int(py)))
+        ray = pinhole_ray(e, camera, px, py)
+    line = row_of_pixel(e, lens, px, py)
     p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), (ray[0] * z, ray[1] * z, z))
     seen = project_rolling(other, given.from_base, p, e.UInt, e.Int)
     inside = known & seen.valid
@@ -141,15 +150,11 @@ def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: 
 
     @recorded_from(IntensityInput)
     def kernel(given: IntensityInput) -> Any:
-        p = given.x, given.y, given.z
-        if ref_lens.lines > 1:
-            _, x, y = grid(e, ref.width, ref.height, stride)
-            line = e.UInt(ref_lens.line_of(e.Int(x), e.Int(y)))
-            p = move(gather(given.to_base, line, TO_BASE, stride=TO_BASE), p)
+        _, x, y = grid(e, ref.width, ref.height, stride)
+        p = moved_to_base(e, ref_lens, given.to_base, x, y, (given.x, given.y, given.z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         active = (given.z > 0.0) & seen.valid
-        a, b, c, d, fx, fy, active = bilinear(e, given.image, width, height, seen.x * shrink, seen.y * shrink, active)
-        value = dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy)
+        value, active = bilinear_value(e, given.image, width, height, seen.x * shrink, seen.y * shrink, active)
         gain, offset = (dr.gather(e.Float, given.brightness, e.UInt(i)) for i in (0, 1))
         expected = given.intensity + dr.fma(gain, given.intensity - MID_GREY, offset)
         return dr.select(active & dr.isfinite(value), value - expected, _UNKNOWN)

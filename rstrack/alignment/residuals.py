@@ -29,13 +29,16 @@ from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.sampling import (
+    BEHIND,
     EDGE,
     NEAREST,
     blur_length,
     blur_weight,
     grid,
     level_size,
+    moved_to_base,
     nearest,
+    row_of_pixel,
     surface,
     value_and_slope,
 )
@@ -44,12 +47,6 @@ WHOLE = 3
 """Unknowns of a depth image as a whole: offset and two tilts of its inverse depth."""
 # Length of a ray, z being 1, times its x or y: of pixels 60° off the axis.
 _WIDEST = 4.0
-# Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
-_BEHIND = 0.02
-
-
-def _line_index(e: Engine, lens: Lens, x: Any, y: Any) -> Any:
-    return e.UInt(0) if lens.lines == 1 else e.UInt(lens.line_of(e.Int(x), e.Int(y)))
 
 
 @dataclass(frozen=True)
@@ -95,7 +92,7 @@ def geometric_kernel(
             active = pixels.meant & (z > 0.0)
             even = evened(z, parameters[2])
             xn, yn = (dr.gather(e.Float, ray, pixels.index) for ray in (given.rays_x, given.rays_y))
-            line = _line_index(e, lens, pixels.x, pixels.y)
+            line = row_of_pixel(e, lens, pixels.x, pixels.y)
             to_base = gather(given.to_base, line, TO_BASE, stride=TO_BASE)
             p = move(to_base, (xn * z, yn * z, z))
             seen = project_rolling(ref_lens, given.from_base, p, e.UInt, e.Int)
@@ -209,9 +206,8 @@ def photometric_kernel(
             x, y, z, intensity, visible = (dr.gather(e.Float, values, pixels.number) for values in stored)
             p: Vector = x, y, z
             active = pixels.meant & (z > 0.0) & (visible > 0.5)
-            ref_line = _line_index(e, ref_lens, pixels.x, pixels.y)
-            if ref_lens.lines > 1:
-                p = move(gather(given.to_base, ref_line, TO_BASE, stride=TO_BASE), p)
+            ref_line = row_of_pixel(e, ref_lens, pixels.x, pixels.y)
+            p = moved_to_base(e, ref_lens, given.to_base, pixels.x, pixels.y, p)
             seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
             u, v = seen.x * shrink, seen.y * shrink
             value, dx, dy, active = value_and_slope(e, given.image, width, height, u, v, active & seen.valid)
@@ -258,16 +254,14 @@ def visibility_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Cal
 
     @recorded_from(VisibilityInput)
     def kernel(given: VisibilityInput) -> Any:
-        p = given.x, given.y, given.z
-        if ref_lens.lines > 1:
-            _, x, y = grid(e, ref.width, ref.height, stride)
-            p = move(gather(given.to_base, _line_index(e, ref_lens, x, y), TO_BASE, stride=TO_BASE), p)
+        _, x, y = grid(e, ref.width, ref.height, stride)
+        p = moved_to_base(e, ref_lens, given.to_base, x, y, (given.x, given.y, given.z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         inside = seen.valid & (given.z > 0.0)
         inside &= (seen.x >= 0.0) & (seen.y >= 0.0) & (seen.x < camera.width - 1.0) & (seen.y < camera.height - 1.0)
         index = nearest(e, camera.width, seen.x, seen.y, inside)
         z = dr.gather(e.Float, given.depth, index, inside)
-        hidden = inside & (z > 0.0) & (seen.z > z * (1.0 + EDGE) + _BEHIND)
+        hidden = inside & (z > 0.0) & (seen.z > z * (1.0 + EDGE) + BEHIND)
         return dr.select(hidden, e.Float(0.0), e.Float(1.0))
 
     return kernel

@@ -83,9 +83,9 @@ def untimed(_: str) -> AbstractContextManager[None]:
 class DeviceRig:
     """Lenses and rays of a rig as a method sees them; takes its frames to the device.
 
-    rays (h, w, 2): normalised coordinates of the depth camera's pixels; device_rays: the same on the device.
-    depth_lens, color_lens: the cameras. sigma: how far the rig may be wrong. resolution: step of the depth camera
-    (1/m), 0 until its first images have shown one.
+    rays (h, w, 2): normalised coordinates of the depth camera's pixels; device_rays: the same on the device. sees
+    (h, w): see `lens_sees`. depth_lens, color_lens: the cameras. sigma: how far the rig may be wrong. resolution: step
+    of the depth camera (1/m), 0 until its first images have shown one.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer = untimed) -> None:
@@ -95,7 +95,7 @@ class DeviceRig:
         self.e = engine(options.backend)
         self.depth_lens = Lens(rig.depth_camera, _seen_as(rig.depth_shutter, options.rolling))
         self.color_lens = Lens(rig.color_camera, _seen_as(rig.color_shutter, options.rolling))
-        self._seen = lens_sees(rig.depth_camera)
+        self.sees = lens_sees(rig.depth_camera)
         self._finer = octaves_finer(rig.color_camera, rig.depth_camera)
         size = rig.color_camera.width, rig.color_camera.height
         self._evening = 1.0 + np.float32(rig.color_falloff) * corner_distance2(*size) if rig.color_falloff else None
@@ -113,15 +113,22 @@ class DeviceRig:
             z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
             if self.resolution == 0.0 and index < _SETTLED:
                 self.resolution = depth_resolution(z)
-            exposure = self._exposure(frame.depth, self.depth_lens, rig.depth_shutter, np.eye(4))
-            depth = depth_image(self.e, exposure, np.where(self._seen, z, 0.0), options.max_depth, self.resolution)
+            z = np.where(self.sees, z, 0.0)
+            depth = depth_image(self.e, self.depth_exposure(frame.depth), z, options.max_depth, self.resolution)
             colors = []
             for image in frame.colors if options.photometric else ():
                 pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
-                late = replace(image, stamp=image.stamp + color_late_s)
-                exposure = self._exposure(late, self.color_lens, rig.color_shutter, rig.T_color_depth)
+                exposure = self.color_exposure(replace(image, stamp=image.stamp + color_late_s))
                 colors.append(color_image(self.e, exposure, pixels, self._finer, self._evening))
             return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size, color_late_s)
+
+    def depth_exposure(self, image: Image) -> Exposure:
+        """When and how the lines of a depth image are exposed."""
+        return self._exposure(image, self.depth_lens, self._rig.depth_shutter, np.eye(4))
+
+    def color_exposure(self, image: Image) -> Exposure:
+        """The same of a colour image."""
+        return self._exposure(image, self.color_lens, self._rig.color_shutter, self._rig.T_color_depth)
 
     @staticmethod
     def _exposure(image: Image, lens: Lens, true: Shutter, T_cam_body: FloatArray) -> Exposure:

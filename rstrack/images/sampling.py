@@ -8,10 +8,13 @@ import drjit as dr
 
 from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
+from rsgen.device.projection import TO_BASE, Vector, gather, move
 from rsgen.geometry.camera import Camera
 
 # Relative spread of inverse depth within 2×2 pixels from which on they lie on both sides of an edge.
 EDGE = 0.03
+# Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
+BEHIND = 0.02
 # Largest factor by which the errors of near depth count more than those of the median depth.
 NEAREST = 2.0
 
@@ -25,6 +28,37 @@ def grid(e: Engine, width: int, height: int, stride: int) -> tuple[Any, Any, Any
     return y * width + x, x, y
 
 
+def pinhole_ray(e: Engine, camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
+    """Normalised coordinates of pixels, whose numbers are integers, of a pinhole image."""
+    return (e.Float(x) - camera.cx) / camera.fx, (e.Float(y) - camera.cy) / camera.fy
+
+
+def depth_of(rho: Any) -> tuple[Any, Any]:
+    """Depth where inverse depth is known, else 1, and where it is."""
+    known = rho > 0.0
+    return dr.rcp(dr.select(known, rho, 1.0)), known
+
+
+def pinhole_points(e: Engine, camera: Camera, rho: Any) -> tuple[Vector, Any]:
+    """Points that a rectified image's pixels see, by inverse depth `rho`, in its camera's frame; and which have any."""
+    _, x, y = grid(e, camera.width, camera.height, 1)
+    z, known = depth_of(rho)
+    xn, yn = pinhole_ray(e, camera, x, y)
+    return (xn * z, yn * z, z), known
+
+
+def row_of_pixel(e: Engine, lens: Lens, x: Any, y: Any) -> Any:
+    """Number of the line that exposes a pixel; 0 where all are exposed at once."""
+    return e.UInt(0) if lens.lines == 1 else e.UInt(lens.line_of(e.Int(x), e.Int(y)))
+
+
+def moved_to_base(e: Engine, lens: Lens, to_base: Any, x: Any, y: Any, p: Vector) -> Vector:
+    """Points that pixels of an image see, in the base frame, by the poses of their own lines; p if it is rectified."""
+    if lens.lines == 1:
+        return p
+    return move(gather(to_base, row_of_pixel(e, lens, x, y), TO_BASE, stride=TO_BASE), p)
+
+
 def bilinear(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
     """Four neighbours (00, 10, 01, 11), the position between them, and whether all are inside."""
     active = active & (x >= 0.0) & (y >= 0.0) & (x < width - 1.0) & (y < height - 1.0)
@@ -32,6 +66,12 @@ def bilinear(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, act
     index = e.UInt(e.Int(dr.select(active, y0, 0.0))) * width + e.UInt(e.Int(dr.select(active, x0, 0.0)))
     near = [dr.gather(e.Float, image, index + offset, active) for offset in (0, 1, width, width + 1)]
     return (*near, x - x0, y - y0, active)
+
+
+def bilinear_value(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+    """The bilinear value at (x, y), and whether all four neighbours are inside."""
+    a, b, c, d, fx, fy, active = bilinear(e, image, width, height, x, y, active)
+    return dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy), active
 
 
 def value_and_slope(

@@ -15,7 +15,16 @@ import drjit as dr
 from rsgen.device.arrays import Engine, recorded, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, gather, move, project, project_rolling
-from rstrack.images.sampling import bilinear, grid, level_size, nearest, surface
+from rstrack.images.sampling import (
+    bilinear_value,
+    depth_of,
+    grid,
+    level_size,
+    moved_to_base,
+    nearest,
+    pinhole_ray,
+    surface,
+)
 
 # Each iteration shrinks the error by the picture's stretching, a few per cent.
 ITERATIONS = 6
@@ -27,11 +36,8 @@ def _ray(e: Engine, lens: Lens, rays: tuple[Any, Any], x: Any, y: Any, active: A
     camera = lens.camera
     if camera.model == "pinhole":
         return (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-    out = []
-    for table in rays:
-        a, b, c, d, fx, fy, _ = bilinear(e, table, camera.width, camera.height, x, y, active)
-        out.append(dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy))
-    return out[0], out[1]
+    xn, yn = (bilinear_value(e, table, camera.width, camera.height, x, y, active)[0] for table in rays)
+    return xn, yn
 
 
 def _pose(e: Engine, lens: Lens, to_base: Any, x: Any, y: Any) -> list[Any]:
@@ -110,16 +116,12 @@ def color_kernel(e: Engine, lens: Lens, base: Lens, level: int = 0) -> Callable[
 
     @recorded_from(ColorInput)
     def kernel(given: ColorInput) -> Any:
-        active = given.inverse_depth > 0.0
-        z = dr.rcp(dr.select(active, given.inverse_depth, 1.0))
-        p = given.rays_x * z, given.rays_y * z, z
-        if base.lines > 1:
-            _, x, y = grid(e, base.camera.width, base.camera.height, 1)
-            p = move(gather(given.to_base, e.UInt(base.line_of(e.Int(x), e.Int(y))), TO_BASE, stride=TO_BASE), p)
+        z, active = depth_of(given.inverse_depth)
+        _, x, y = grid(e, base.camera.width, base.camera.height, 1)
+        p = moved_to_base(e, base, given.to_base, x, y, (given.rays_x * z, given.rays_y * z, z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         u, v = seen.x * shrink, seen.y * shrink
-        a, b, c, d, fx, fy, active = bilinear(e, given.image, width, height, u, v, active & seen.valid)
-        value = dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy)
+        value, active = bilinear_value(e, given.image, width, height, u, v, active & seen.valid)
         active &= dr.isfinite(value)  # not clipped
         return dr.select(active, value, 0.0), dr.select(active, e.Float(1.0), 0.0)
 
@@ -153,9 +155,8 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[FusionInput], An
         rho, weight = given.inverse_depth, given.weight
         gate, limit = dr.gather(e.Float, given.constants, e.UInt(0)), dr.gather(e.Float, given.constants, e.UInt(1))
         _, px, py = grid(e, base.camera.width, base.camera.height, 1)
-        xn, yn = (e.Float(px) - base.camera.cx) / base.camera.fx, (e.Float(py) - base.camera.cy) / base.camera.fy
-        active = rho > 0.0
-        z = dr.rcp(dr.select(active, rho, 1.0))
+        xn, yn = pinhole_ray(e, base.camera, px, py)
+        z, active = depth_of(rho)
         seen = project_rolling(lens, given.from_base, (xn * z, yn * z, z), e.UInt, e.Int)
         value, active = surface(e, lens.camera, given.source, seen.x, seen.y, active & seen.valid)
         z_there = dr.rcp(dr.select(active, value, 1.0))

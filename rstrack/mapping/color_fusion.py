@@ -29,7 +29,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.line_poses import Exposure, from_base, line_twists, rows_of
 from rstrack.images.pyramid import DepthImage
-from rstrack.images.sampling import EDGE, bilinear, blur_weight, grid
+from rstrack.images.sampling import BEHIND, EDGE, bilinear, blur_weight, pinhole_points
 from rstrack.keyframes.keyframe import Reference
 
 SIGMA_PX = 1.0
@@ -37,8 +37,6 @@ SIGMA_PX = 1.0
 _LEAST = 1e-6
 # Weight of a pixel at most, in sharp views; more would let a keyframe's first errors live for ever.
 _MOST = 30.0
-# Metres that a point has to lie behind what is seen there to count as hidden, beside EDGE of its depth.
-_BEHIND = 0.02
 
 
 @dataclass(frozen=True)
@@ -128,18 +126,6 @@ class ColorFusion:
         return np.rint(255.0 * srgb.encode(np.clip(light, 0.0, 1.0))).astype(np.uint8), weight
 
 
-def _points(e: Engine, base: Lens, rho: Any) -> tuple[Any, tuple[Any, Any, Any]]:
-    """Which pixels have depth, and their points in the base frame."""
-    _, px, py = grid(e, base.camera.width, base.camera.height, 1)
-    active = rho > 0.0
-    z = dr.rcp(dr.select(active, rho, 1.0))
-    return active, (
-        (e.Float(px) - base.camera.cx) / base.camera.fx * z,
-        (e.Float(py) - base.camera.cy) / base.camera.fy * z,
-        z,
-    )
-
-
 def _hidden(e: Engine, lens: Lens, depth: Any, seen: RollingProjection, active: Any) -> Any:
     """Points behind the nearest of the four depths around them: a pixel next to an edge shows both sides."""
     *around, _, _, inside = bilinear(
@@ -147,7 +133,7 @@ def _hidden(e: Engine, lens: Lens, depth: Any, seen: RollingProjection, active: 
     )
     hidden = e.Bool(False)
     for z in around:
-        hidden |= inside & (z > 0.0) & (seen.z > z * (1.0 + EDGE) + _BEHIND)
+        hidden |= inside & (z > 0.0) & (seen.z > z * (1.0 + EDGE) + BEHIND)
     return hidden
 
 
@@ -212,7 +198,7 @@ def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable
     @recorded_from(_AddInput)
     def kernel(given: _AddInput) -> Any:
         inv_sigma2, least, most = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(3))
-        active, p = _points(e, base, given.inverse_depth)
+        p, active = pinhole_points(e, base.camera, given.inverse_depth)
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         active &= seen.valid & ~_hidden(
             e, depth_lens, given.depth, project_rolling(depth_lens, given.depth_from_base, p, e.UInt, e.Int), active
@@ -243,7 +229,7 @@ def _inherit_kernel(e: Engine, older: Lens, base: Lens) -> Callable[..., Any]:
 
     @recorded
     def kernel(rho: Any, r: Any, g: Any, b: Any, weight: Any, older_rho: Any, T_old_new: Any) -> Any:
-        active, p = _points(e, base, rho)
+        p, active = pinhole_points(e, base.camera, rho)
         at = project(older.camera, move(gather(T_old_new, e.UInt(0), 12, stride=12), p))
         *near, _, _, active = bilinear(e, older_rho, width, height, at.x, at.y, active & at.valid)
         for value in near:

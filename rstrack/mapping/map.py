@@ -16,24 +16,23 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.device.arrays import Engine, Kernels, engine, recorded
+from rsgen.device.arrays import Engine, Kernels, recorded
 from rsgen.device.lens import Lens
 from rsgen.device.projection import project_rolling
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.geometry.shutter import Shutter
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.rig import Frame, Rig
-from rstrack.images.device_frame import MARGIN
+from rstrack.images.device_frame import MARGIN, DeviceRig
 from rstrack.images.line_poses import IDENTITY_TO_BASE, Exposure, from_base_table, rows_of, to_base_table
-from rstrack.images.pyramid import camera_rays, depth_image, lens_sees
-from rstrack.images.sampling import bilinear, grid
+from rstrack.images.pyramid import depth_image
+from rstrack.images.sampling import bilinear_value, pinhole_points
 from rstrack.keyframes.keyframe import rectified_lens
 from rstrack.keyframes.rectification import rectify_kernel
 from rstrack.metrics.association import compare, truth_of
-from rstrack.options import MapOptions
+from rstrack.options import MapOptions, Options
 from rstrack.volume.mesh import TriangleSurface, extract_surface, write_ply
 from rstrack.volume.volume import Volume
 
@@ -64,31 +63,27 @@ class Reconstruction:
 class FrameMapper:
     """Frames of a rig, with the motion of an estimate, into a volume."""
 
-    def __init__(self, e: Engine, rig: Rig, estimate: Estimate, shutter: Literal["rs", "gs"], volume: Volume,
-                 T_world_estimate: FloatArray, max_depth: float) -> None:  # fmt: skip
-        self._e, self._rig, self._estimate, self._rolling = e, rig, estimate, shutter == "rs"
-        self._volume, self._T_world_estimate, self._max_depth = volume, T_world_estimate, max_depth
-        self._depth_lens, self._color_lens = (
-            self._seen_as(rig.depth_camera, rig.depth_shutter),
-            self._seen_as(rig.color_camera, rig.color_shutter),
-        )
+    def __init__(
+        self, device: DeviceRig, rig: Rig, estimate: Estimate, volume: Volume, T_world_estimate: FloatArray,
+        rolling: bool, max_depth: float,
+    ) -> None:  # fmt: skip
+        self._device, self._rig, self._estimate, self._max_depth = device, rig, estimate, max_depth
+        self._volume, self._T_world_estimate = volume, T_world_estimate
         self.base = rectified_lens(rig.depth_camera)
-        rays = camera_rays(Exposure(self._depth_lens, 0.0, np.eye(4)))
-        self._rays, self._seen = tuple(e.upload(rays[..., i]) for i in (0, 1)), lens_sees(rig.depth_camera)
-        self._kernel = Kernels(e)
+        self._kernel, self._rolling = Kernels(device.e), rolling
 
     def __call__(self, frame: Frame, number: int) -> bool:
         """Integrate one frame of the data set without what moves by itself; False if the estimate does not cover it.
 
         Raises UserError if the estimate has masks of images of another size.
         """
-        e = self._e
-        exposure = Exposure(self._depth_lens, frame.depth.stamp + self._middle("depth"), np.eye(4))
+        device, e = self._device, self._device.e
+        exposure = device.depth_exposure(frame.depth)
         t = exposure.mid_time
         if not self._covered(exposure):
             return False
         T_estimate_base = self._pose(t)
-        z = np.where(self._seen, frame.depth.pixels, 0.0)
+        z = np.where(device.sees, frame.depth.pixels, 0.0)
         camera = self._rig.depth_camera
         # Its colours are taken a little later, and from beside: what is next to it is seen better by other frames.
         moving = self._estimate.moving.of(number, camera.height, camera.width, round(MARGIN * camera.width))
@@ -98,8 +93,8 @@ class FrameMapper:
             seen_at = to_base_table(self._estimate.spline, T_estimate_base, exposure)
         else:
             seen_at = IDENTITY_TO_BASE
-        rectify = self._kernel(rectify_kernel, self._depth_lens, self.base)
-        rho, _, _ = rectify(depth.inverse_z, *self._rays, e.upload(seen_at))
+        rectify = self._kernel(rectify_kernel, device.depth_lens, self.base)
+        rho, _, _ = rectify(depth.inverse_z, *device.device_rays, e.upload(seen_at))
         self._volume.integrate(
             rho, self._T_world_estimate @ T_estimate_base, self.base, color=self._colors(frame, rho, T_estimate_base, t)
         )
@@ -107,15 +102,12 @@ class FrameMapper:
 
     def _colors(self, frame: Frame, rho: Any, T_estimate_base: FloatArray, t: float) -> list[Any] | None:
         """Red, green, blue and their weight at the rectified pixels, from the colour image nearest in time."""
-        exposures = [
-            Exposure(self._color_lens, image.stamp + self._middle("color"), self._rig.T_color_depth)
-            for image in frame.colors
-        ]
+        exposures = [self._device.color_exposure(image) for image in frame.colors]
         usable = [i for i, exposure in enumerate(exposures) if self._covered(exposure)]
         if not usable:
             return None
         best = min(usable, key=lambda i: abs(exposures[i].mid_time - t))
-        exposure, e = exposures[best], self._e
+        exposure, e = exposures[best], self._device.e
         if self._rolling:
             assert self._estimate.spline is not None
             from_base = from_base_table(self._estimate.spline, T_estimate_base, exposure)
@@ -123,7 +115,9 @@ class FrameMapper:
             T = self._rig.T_color_depth @ se3.inverse(self._pose(exposure.mid_time)) @ T_estimate_base
             from_base = np.concatenate([rows_of(T), np.zeros(6)])
         planes = [e.upload(plane / np.float32(255.0)) for plane in np.moveaxis(frame.colors[best].pixels, -1, 0)]
-        out: list[Any] = self._kernel(_lookup_kernel, self._color_lens, self.base)(rho, *planes, e.upload(from_base))
+        out: list[Any] = self._kernel(_lookup_kernel, self._device.color_lens, self.base)(
+            rho, *planes, e.upload(from_base)
+        )
         return out
 
     def _pose(self, t: float) -> FloatArray:
@@ -141,19 +135,6 @@ class FrameMapper:
         around = stamps[[max(after - 1, 0), min(after, len(stamps) - 1)]]
         return bool((np.abs(around - times[0]) <= _POSE_WITHIN_S).all())
 
-    def _seen_as(self, camera: Any, shutter: Shutter) -> Lens:
-        return Lens(camera, shutter if self._rolling else Shutter(0.0, shutter.exposure_s, shutter.scan))
-
-    def _middle(self, stream: Literal["color", "depth"]) -> float:
-        """Seconds from the stamp to the line whose time stands for all of them; 0 where each has its own."""
-        if self._rolling:
-            return 0.0
-        rig = self._rig
-        camera, shutter = (
-            (rig.color_camera, rig.color_shutter) if stream == "color" else (rig.depth_camera, rig.depth_shutter)
-        )
-        return 0.5 * (shutter.line_count(camera) - 1) * shutter.line_delay(camera)
-
 
 def _lookup_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
     """Kernel (inverse_depth, red, green, blue, from_base) → [red, green, blue, 1 where seen], equation (3).
@@ -164,16 +145,13 @@ def _lookup_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
 
     @recorded
     def kernel(rho: Any, red: Any, green: Any, blue: Any, from_base: Any) -> Any:
-        _, px, py = grid(e, base.camera.width, base.camera.height, 1)
-        active = rho > 0.0
-        z = dr.rcp(dr.select(active, rho, 1.0))
-        p = (e.Float(px) - base.camera.cx) / base.camera.fx * z, (e.Float(py) - base.camera.cy) / base.camera.fy * z, z
+        p, active = pinhole_points(e, base.camera, rho)
         seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
         out = []
         inside = active & seen.valid
         for plane in (red, green, blue):
-            a, b, c, d, fx, fy, inside = bilinear(e, plane, camera.width, camera.height, seen.x, seen.y, inside)
-            out.append(dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy))
+            value, inside = bilinear_value(e, plane, camera.width, camera.height, seen.x, seen.y, inside)
+            out.append(value)
         return [*(dr.select(inside, value, 0.0) for value in out), dr.select(inside, e.Float(1.0), 0.0)]
 
     return kernel
@@ -189,9 +167,10 @@ def reconstruct(
     if shutter == "rs" and estimate.spline is None:
         raise UserError("map: the estimate has no spline, so lines have no poses of their own: use --shutter gs")
     T_world_estimate, world = _world(dataset, estimate, options.world)
-    e = engine(options.backend)
-    volume = Volume(e, options.voxel_m, options.color, most_bytes=1e9 * options.memory_gb)
-    mapper = FrameMapper(e, dataset.rig, estimate, shutter, volume, T_world_estimate, options.max_depth)
+    seen_as = Options(method=f"{shutter}-g", backend=options.backend)  # type: ignore[arg-type]
+    device = DeviceRig(dataset.rig, seen_as)
+    volume = Volume(device.e, options.voxel_m, options.color, most_bytes=1e9 * options.memory_gb)
+    mapper = FrameMapper(device, dataset.rig, estimate, volume, T_world_estimate, shutter == "rs", options.max_depth)
     chosen = range(0, len(dataset), options.every)
     done = 0
     images = prefetched(lambda k: dataset.frame(k, color=options.color), chosen, 2)

@@ -17,7 +17,7 @@ import drjit as dr
 from rsgen.device.arrays import Engine, recorded
 from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, gather, move, project
-from rstrack.images.sampling import EDGE, grid, nearest, surface
+from rstrack.images.sampling import EDGE, depth_of, grid, nearest, pinhole_ray, surface
 
 BLOCK = 8
 POINTS = BLOCK**3
@@ -63,7 +63,7 @@ def scale_kernel(e: Engine, lens: Lens) -> Callable[..., Any]:
             smooth &= (dr.minimum(before, after) > 0.0) & (dr.abs(before + after - 2.0 * here) < EDGE * here)
             smooth &= dr.abs(here - at) < EDGE * at
             slopes.append((after - before) * (focal / (2.0 * _REACH)))
-        xn, yn = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
+        xn, yn = pinhole_ray(e, camera, px, py)
         nz = at - slopes[0] * xn - slopes[1] * yn
         plane = dr.rsqrt(slopes[0] * slopes[0] + slopes[1] * slopes[1] + nz * nz)
         along = dr.sqrt(xn * xn + yn * yn + 1.0) / at
@@ -83,9 +83,8 @@ def sight_kernel(e: Engine, lens: Lens, band_m: float, voxel_m: float) -> Callab
     def kernel(rho: Any, pose: Any, box: Any) -> Any:
         index, px, py = grid(e, camera.width, camera.height, _STRIDE)
         at = dr.gather(e.Float, rho, index)
-        active = at > 0.0
-        z = dr.rcp(dr.select(active, at, 1.0))
-        xn, yn = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
+        z, active = depth_of(at)
+        xn, yn = pinhole_ray(e, camera, px, py)
         length = dr.sqrt(xn * xn + yn * yn + 1.0)
         M, limits = gather(pose, e.UInt(0), 12), _integers(e, box, 6)
         out = []
@@ -162,7 +161,7 @@ def raycast_kernel(e: Engine, lens: Lens, voxel_m: float, truncation_m: float, c
     @recorded
     def kernel(pose: Any, box: Any, near: Any, directory: Any, sums: Any) -> Any:
         _, px, py = grid(e, camera.width, camera.height, 1)
-        xn, yn = (e.Float(px) - camera.cx) / camera.fx, (e.Float(py) - camera.cy) / camera.fy
+        xn, yn = pinhole_ray(e, camera, px, py)
         M, limits = gather(pose, e.UInt(0), 12), _integers(e, box, 6)
         length = dr.sqrt(xn * xn + yn * yn + 1.0) * (1.0 / voxel_m)
         origin = tuple(c * (1.0 / voxel_m) for c in M[9:12])
