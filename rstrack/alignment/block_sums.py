@@ -121,7 +121,7 @@ class Scaling:
 def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:
     """Blocks of current lines and of reference lines (1 if rectified), and lines per block of each.
 
-    Sums of an image whose lines are exposed at once are kept apart too: their scatter says how far its pixels are
+    Sums of an image whose lines are exposed at once are separate too: their scatter shows how far its pixels are
     independent (`BlockSums.summed` is what they come to).
     """
     blocks = BLOCKS if ref_lens.lines == 1 else PAIR_BLOCKS
@@ -176,9 +176,9 @@ def contribution(
 ) -> Contribution:  # fmt: skip
     """w j jᵀ and so on of pixels, from `slot` on (`block_slot`); j = sign [g, p × g].
 
-    c: see `ColumnSums`, each at most 1. judged: pixels that tell σ and are counted; others only add to the system
-    and the cost. curved: so many columns, the first, have Newton's curvature as j has: what they share with a motion
-    would pass for information if the two had different ones.
+    c: see `ColumnSums`, each at most 1. judged: pixels that σ is estimated from and that are counted; others only add
+    to the system and the cost. curved: so many columns, the first, have Newton's curvature as j has: what they share
+    with a motion would pass for information if the two had different ones.
     """
     inv_sigma, gate, inv_lever, bound, unit_H, unit_g, unit_cost = parameters
     compared = active & dr.isfinite(r)
@@ -196,7 +196,7 @@ def contribution(
     hj = [h * c for c in wj]
     sums = [hj[a] * j[b] for a, b in zip(*_UPPER, strict=True)]
     sums += [c * s * (sign * unit_g) for c in wj]
-    told = dr.select(active & judged, w * s * s * unit_cost, 0.0), cost(s) * unit_cost
+    statistics = dr.select(active & judged, w * s * s * unit_cost, 0.0), cost(s) * unit_cost
     counted = [dr.select(which & judged, e.Int(1), e.Int(0)) for which in (active, compared)]
     c = [dr.select(active, bound * column, 0.0) for column in c]
     more = [sign * one * column for column in c for one in hj]
@@ -204,7 +204,7 @@ def contribution(
     bends = [h * w if k < curved else unit_H * w for k in range(len(c))]
     more += [bends[a] * c[a] * c[b] for a, b in zip(*np.triu_indices(len(c)), strict=True)]
     more += [w * s * unit_g * column for column in c]
-    whole = [[e.Int(dr.round(value)) for value in part] for part in ((*sums, *told), more)]
+    whole = [[e.Int(dr.round(value)) for value in part] for part in ((*sums, *statistics), more)]
     return Contribution(slot, (*whole[0], *counted, *whole[1]), compared)
 
 

@@ -12,11 +12,11 @@ from rsgen.array_types import FloatArray
 from rstrack.alignment.normal_equations import Eliminated
 
 MID_GREY = 0.5
-"""Intensity about which the gain turns: gain and offset are then told apart best."""
+"""Intensity about which the gain turns: gain and offset are then least correlated."""
 
 SIGMA = np.array([0.3, 0.15])
 """σ by which gain and offset change from one frame to the next without any reason: it holds them where an image is too
-plain to tell them apart."""
+plain to separate them."""
 # Gains and offsets that no camera shows: it is another place.
 _LEAST, _MOST = np.array([-0.7, -0.6]), np.array([2.0, 0.6])
 # Change of an image's mean or standard deviation that its moving view explains from one frame to the next.
@@ -61,7 +61,7 @@ def absolute(image: FloatArray, reference: FloatArray) -> FloatArray:
 def expected(before: FloatArray, moments: FloatArray, moments_before: FloatArray) -> FloatArray:
     """Gain and offset (2,) of an image against a third, from those of the one before and the moments (2,) of both.
 
-    The same as before, unless the images as a whole say otherwise.
+    The same as before, unless the means and spreads of the images differ.
     """
     if np.abs(moments - moments_before).max() < _STEADY:
         return before

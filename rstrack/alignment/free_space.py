@@ -38,7 +38,7 @@ from rstrack.images.sampling import (
 )
 from rstrack.keyframes.keyframe import Reference, pyramid_level, strides
 
-# What a kernel writes where it cannot tell: no metres, and no intensity, are as large.
+# What a kernel writes where nothing is known: no metres, and no intensity, are as large.
 _UNKNOWN = 1e6
 # Pixels of the largest grid that is compared: what moves need not be known to the pixel.
 _GRID_PX = 160 * 120
@@ -85,7 +85,7 @@ def _moved(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool, give
 
 
 def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[SpaceInput], Any]:
-    """Kernel → (1/z, free) at every stride-th pixel of `lens`, see `Free`: 0 and `_UNKNOWN` where not to be told.
+    """Kernel → (1/z, free) at every stride-th pixel of `lens`, see `Free`: 0 and `_UNKNOWN` where that is not known.
 
     has_rays: whether the image's rays are given; a rectified one's are those of its pinhole.
     """
@@ -111,7 +111,7 @@ def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays:
 def meeting_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[MeetingInput], Any]:
     """Kernel → (apart, value) at the same pixels, see `SeenFrom`.
 
-    `_UNKNOWN` where not to be told; a value of twice that outside the other image.
+    `_UNKNOWN` where that is not known; a value of twice that outside the other image.
     """
     columns = -(-other.camera.width // stride)
 
@@ -164,7 +164,7 @@ def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: 
 
 @dataclass(frozen=True)
 class Free:
-    """Whether pixels of an image's grid (gh, gw) stand in what the other image saw through; NaN where not to be told.
+    """Whether pixels of an image's grid (gh, gw) stand in what the other image saw through; NaN: unknown.
 
     z (m): the image's own depth; free (m): how far it stands in front of all that the other shows about there.
     """
@@ -257,7 +257,7 @@ def _lens(image: Reference | DepthImage) -> Lens:
 
 
 def grid_of(lens: Lens) -> tuple[int, int]:
-    """Level of the keyframe's points whose grid is fine enough to tell what moves, and its stride in pixels."""
+    """Level of the keyframe's points whose grid is fine enough to find what moves, and its stride in pixels."""
     camera = lens.camera
     every = strides(camera.width, camera.height)[:-1]
     for level, stride in enumerate(every):

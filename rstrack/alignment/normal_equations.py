@@ -187,8 +187,8 @@ def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24) -> FloatArray:
 
 
 def solve_damped(H: FloatArray, g: FloatArray, bandwidth: int, damping: float = 0.0) -> FloatArray:
-    """The step (n,) of Levenberg-Marquardt; rounding can make a system indefinite that hardly tells some motion: then
-    damped more. Raises numpy.linalg.LinAlgError where no damping helps."""
+    """The step (n,) of Levenberg-Marquardt, damped more where rounding makes the system indefinite, as it does where a
+    motion is hardly observed. Raises numpy.linalg.LinAlgError where no damping helps."""
     for _ in range(8):
         damped = H.copy()
         damped[np.diag_indices_from(H)] *= 1.0 + damping

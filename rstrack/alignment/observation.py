@@ -1,4 +1,4 @@
-"""An image against a reference: its scale and its last linearisation, kept as long as it is good."""
+"""An image against a reference: its scale and its last linearisation, used as long as it is good."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rstrack.options import Options
 _SAME_SLOPES = 2e-2
 # Change of gain and offset, in σ of the intensities, that calls for a new linearisation.
 _SAME = 0.2
-# Part of the pixels that count below which a quarter of them tells as much as all.
+# Part of the pixels that count below which a quarter of them has as much information as all.
 THIN_BELOW = 1.0 / 16.0
 
 
@@ -48,9 +48,9 @@ class _Linearisation:
 class Observation:
     """An image against a reference. linearisation: the last one; putting an earlier one back takes a step back.
 
-    occluder: the depth image that tells which points of the reference a colour image cannot see. expected: gain and
-    offset (2,) of a colour image against the reference, as far as can be told beforehand.
-    independent: part of its pixels that count, see `Independence`.
+    occluder: the depth image that shows which points of the reference are hidden from a colour image. expected:
+    predicted gain and offset (2,) of a colour image against the reference. independent: part of its pixels that count,
+    see `Independence`.
     """
 
     frame: int
@@ -99,7 +99,7 @@ class Observation:
         self.ref, self._visible = ref, None
 
     def hidden_by(self, occluder: DepthImage) -> None:
-        """Take another depth image to tell which points a colour image cannot see."""
+        """Take another depth image to find which points are hidden from a colour image."""
         self.occluder, self._visible = occluder, None
 
     def count_as(self, independent: float) -> None:
@@ -110,7 +110,7 @@ class Observation:
         """The first linearisation takes this σ."""
         self.linearisation = _Linearisation(sigma=sigma)
 
-    def forget(self, state: SplineState, keep_sigma: bool) -> None:
+    def restart(self, state: SplineState, keep_sigma: bool) -> None:
         """Begin anew, as at a new level of the pyramid."""
         sigma = self.linearisation.sigma if keep_sigma else 0.0
         self.linearisation = _Linearisation(sigma=sigma, brightness=self.brightness(state))
@@ -129,7 +129,7 @@ class Observation:
             started = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
         else:
             if is_finest and self._visible is None and self.occluder is not None:
-                # Once: the coarse levels have brought the poses close enough to tell, and a fixed set converges.
+                # Once: the coarse levels have brought the poses close enough, and a fixed set converges.
                 self._visible = terms.visible(self.occluder, self.ref, state.spline, level)
             visible = self._visible if is_finest else None
             sigma = sigma or START_INTENSITY
@@ -172,7 +172,7 @@ class Observation:
         return self.stands_for * float(model.g @ moved + 0.5 * moved @ model.H @ moved)
 
     def distance(self, state: SplineState) -> float:
-        """How far the state is from that of the linearisation, squared, in σ of what this image tells."""
+        """How far the state is from that of the linearisation, squared, in σ of this image's own information."""
         model, moved = self.lin.model, self._since(state).ravel()
         return self.stands_for * float(moved @ model.H @ moved)
 

@@ -55,10 +55,10 @@ class Problem:
     """Observations and priors over the free control points free[0]..free[1].
 
     `fresh` observations go through the pyramid's levels; `settled` ones keep their models of the finest level as long
-    as these are good. `focal` in pixels, to tell how far lines move. `bandwidth`: of the system. rigid: the free
+    as these are good. `focal` in pixels, to measure how far lines move. `bandwidth`: of the system. rigid: the free
     control points move as one body. predicted: all but the noise is known beforehand, so that how far lines move does
-    not tell whether weights and σ are those of the finest level: it is linearised twice there at least, and kept for a
-    quarter of the pixels.
+    not show whether weights and σ are those of the finest level: it is linearised twice there at least, and stays
+    so for a quarter of the pixels.
     """
 
     fresh: Sequence[Observation]
@@ -79,7 +79,7 @@ def optimise(
     """Minimise (12) by Levenberg-Marquardt on each of the pyramid's levels, coarse to fine, most[level] steps at most.
 
     A level ends when no line of the fresh images moves any more. Steps that raise the cost are taken back and damped.
-    hopeless: told the fresh observations after each level; the finer ones are spared where it says so.
+    hopeless: given the fresh observations after each level; True skips the finer ones.
     before_finest: called before the last level if others were before it; may change what the fresh ones see.
     Raises numpy.linalg.LinAlgError where the system has no solution.
     """
@@ -88,7 +88,7 @@ def optimise(
         if before_finest is not None and level == levels[-1] != levels[0]:
             before_finest()
         for observation in problem.fresh:
-            observation.forget(state, keep_sigma=level != levels[0])
+            observation.restart(state, keep_sigma=level != levels[0])
         _optimise_level(terms, state, problem, level, most[level], done)
         if hopeless is not None and hopeless(problem.fresh):
             break
@@ -110,8 +110,8 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
         if step is not None and now > cost + _WORSE * sum(weights.values()):
             # Worse than before: back to where it was, and a shorter step from there.
             state.apply(first, -step)
-            for observation, kept in zip(every, before, strict=True):
-                observation.linearisation = kept
+            for observation, earlier in zip(every, before, strict=True):
+                observation.linearisation = earlier
             priors = [prior(state.spline) for prior in problem.priors]
             damping = max(1e-3, 10.0 * damping) if is_plain else damping
             acceleration.reset()

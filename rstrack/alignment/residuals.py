@@ -141,7 +141,7 @@ def plane_distance(
     """
     at = nearest(e, ref.width, seen.x, seen.y, active)
     mx, my = dr.gather(e.Float, given.slope_x, at, active), dr.gather(e.Float, given.slope_y, at, active)
-    # Where interpolation errs, its bias counts, not its size: such pixels do not tell how good depth is. In coarse
+    # Where interpolation errs, its bias counts, not its size: such pixels are not used to estimate σ. In coarse
     # images, of which they are half, they weigh less the more so they are: without them the flat ones would slide.
     limit, coarse = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
     rough = dr.gather(e.Float, given.roughness, at, active)
@@ -168,7 +168,7 @@ class PhotometricInput:
 
     x, y, z: points of the reference's every stride-th pixel in its camera's frame (m), z = 0 where there is none;
     intensity: theirs; visible: 0 for points that are hidden; to_base: its lines' poses if it is not rectified.
-    image: intensities of the pyramid's level, NaN where they tell nothing; from_base: the colour camera's lines.
+    image: intensities of the pyramid's level, NaN where clipped; from_base: the colour camera's lines.
     constants: those of `Scaling`, and the image's gain and offset, see `alignment.brightness`.
     """
 

@@ -11,7 +11,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 
 # Position u of the last line on its knot interval below which the last control point (weight u³/6) is mere guesswork.
-_TOLD = 0.6
+_OBSERVED = 0.6
 
 
 class SplineState:
@@ -88,8 +88,8 @@ class SplineState:
         start, stop = self.segment(first), self.segment(last) + 4
         gap = np.repeat(points[keep - 1 - self.first][None], max(0, start - keep), axis=0)
         still = np.repeat(T_world_body[None], stop - start, axis=0)
-        kept = points[: min(keep, start) - self.first]
-        spline = Spline(np.concatenate([kept, gap, still]), self.spline.t0, self.dt, self.first)
+        earlier = points[: min(keep, start) - self.first]
+        spline = Spline(np.concatenate([earlier, gap, still]), self.spline.t0, self.dt, self.first)
         state = SplineState(spline, self.done)
         state.untouched = self.spline.t0 + (min(keep, start) - 3) * self.dt
         return state
@@ -113,14 +113,14 @@ class SplineState:
         self.moved = np.concatenate([self.moved, np.zeros((missing, 6))])
 
     def smooth_end(self, t: float) -> None:
-        """Lay the last control point on with constant velocity if lines until time t (s) hardly told where it is.
+        """Lay the last control point on with constant velocity if lines until time t (s) hardly observe it.
 
         It weighs u³/6 in them at most, so that a systematic error of the lines is magnified; and the next control
         points are extrapolated from it.
         """
         points = self.points
         s = (t - self.spline.t0) / self.spline.dt
-        if s - np.floor(s) > _TOLD or self.segment(t) + 4 != self.end:
+        if s - np.floor(s) > _OBSERVED or self.segment(t) + 4 != self.end:
             return
         step = se3.inverse(points[-3]) @ points[-2]
         T = se3.orthonormalise(points[-2] @ step)

@@ -104,7 +104,7 @@ class DeviceRig:
         self.resolution = 0.0
 
     def upload(self, index: int, frame: Frame, color_late_s: float = 0.0) -> DeviceFrame:
-        """Frame `index` of a recording, whose colour was taken so much later than its stamps say.
+        """Frame `index` of a recording, whose colour was taken so much later than its stamps.
 
         Raises UserError if an image's size or type is not the rig's.
         """

@@ -53,7 +53,7 @@ class DepthImage:
 
     @property
     def hider(self) -> DepthImage:
-        """What tells which points colour images taken with it may not see: things have moved a little by then."""
+        """What hides points from colour images taken with it: things have moved a little by then."""
         return self.screen or self.occluder
 
     @property
@@ -155,7 +155,7 @@ def color_image(
 
 
 def _beyond_range(color: npt.NDArray[np.uint8], count: int) -> list[npt.NDArray[np.bool_]]:
-    """For each level the pixels (h, w) whose intensity says nothing: clipped, or smoothed with what was.
+    """For each level the pixels (h, w) whose intensity is unknown: clipped, or smoothed with what was.
 
     Two channels have to be saturated: white paper in warm light saturates red alone, still shows its print, and holds
     the motion against what shines beside it. All three have to be black.

@@ -34,7 +34,7 @@ _FOLLOWED, _STEPS = 12, 12
 _DAMPING, _LONGEST = 1e-3, np.array([0.3, 0.2])
 # Score below which a place is none, and part of the best score that another place needs to be tried.
 _LEAST_SCORE, _RIVAL = 0.15, 0.6
-# Points on a keyframe below which nothing can be said.
+# Points on a keyframe below which there is no search.
 _LEAST_POINTS = 40
 
 

@@ -28,7 +28,7 @@ _RETURN = 0.7
 _NEAR = 1.5
 # Within so many times these, frames are aligned to the oldest keyframe too: fewer hops, less drift.
 _ANCHOR = 2.0
-# Metres at one metre by which model and frame may differ before the frame is believed.
+# Metres at one metre by which model and frame may differ before the frame's depth is used.
 _AGREE = 0.03
 # Error of a surface in the volume, in voxels: where it bends or ends within one, trilinear interpolation cuts it.
 _EXACT_VOXELS = 0.05
@@ -40,38 +40,38 @@ _MEDIAN_TO_SIGMA = 1.4826
 class KeyframeStore:
     """Rectified keyframes in the order in which they were last the reference. made: how many there have been.
 
-    archive: where all but the newest are kept too. anchor: a second, older reference for the frames that are aligned to
-    the newest; only a model has one.
+    archive: where all but the newest are stored too. anchor: a second, older reference for the frames that are aligned
+    to the newest; only a model has one.
     """
 
     def __init__(self, maker: KeyframeMaker, options: Options) -> None:
         self._maker, self._options = maker, options
         self._bytes = 1e9 * options.memory_gb
         self._model = self._no_model()
-        self._kept: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
+        self._recent: deque[Reference] = deque(maxlen=_RECENT if self._model is None else _MODEL_KEYFRAMES)
         self.archive = Archive(maker, self._bytes)
         self.anchor: Reference | None = None
         self.made = 0
 
     def __len__(self) -> int:
-        return len(self._kept)
+        return len(self._recent)
 
     def _no_model(self) -> SurfaceModel | None:
         return SurfaceModel(self._maker, self._options.voxel_m, self._bytes) if self._options.models else None
 
-    def forget_first(self) -> None:
+    def drop_first(self) -> None:
         """The first keyframe, and only one so far, is none."""
-        self._kept.clear()
+        self._recent.clear()
         self._model, self.anchor, self.made = self._no_model(), None, 0
 
     @property
     def newest(self) -> Reference:
         """The one that was the reference last."""
-        return self._kept[-1]
+        return self._recent[-1]
 
-    def put_away(self) -> None:
+    def archive_newest(self) -> None:
         """The newest into the archive too, as it is now."""
-        if self._kept:
+        if self._recent:
             self.archive.add(self.newest)
 
     def candidates(self, frame: DeviceFrame, skip: int, most: int) -> list[Reference]:
@@ -92,12 +92,12 @@ class KeyframeStore:
         return self._found([k for k in sorted(indices, key=far.__getitem__) if far[k] < _NEAR][:most])
 
     def _found(self, indices: list[int]) -> list[Reference]:
-        on_device = {ref.index: ref for ref in self._kept}
+        on_device = {ref.index: ref for ref in self._recent}
         return [on_device[k] if k in on_device else self.archive.get(k) for k in indices]
 
     def use(self, ref: Reference) -> None:
         """A keyframe found again is the newest from now on."""
-        self._kept = deque((k for k in self._kept if k.index != ref.index), maxlen=self._kept.maxlen)
+        self._recent = deque((k for k in self._recent if k.index != ref.index), maxlen=self._recent.maxlen)
         self._use(ref)
         self.anchor = None
 
@@ -122,34 +122,34 @@ class KeyframeStore:
             if self._model is not None:
                 self._model.add(frame.depth, spline)
             if self._options.fuse:
-                self._kept[-1] = self._maker.fused(self.newest, frame.depth, spline)
+                self._recent[-1] = self._maker.fused(self.newest, frame.depth, spline)
         return self.newest
 
     def improve(self, ref: Reference) -> None:
         """Another version of the newest keyframe."""
-        self._kept[-1] = ref
+        self._recent[-1] = ref
 
     def return_to(self, T_world_cam: FloatArray, left: Reference) -> Reference | None:
         """The oldest of a model's keyframes but `left` that is near a camera: it has drifted least. Now the newest."""
         if self._model is None:
             return None
         near = [
-            ref for ref in self._kept if ref is not left and self._remoteness(ref.T_world_base, T_world_cam) < _RETURN
+            ref for ref in self._recent if ref is not left and self._remoteness(ref.T_world_base, T_world_cam) < _RETURN
         ]
         if not near:
             return None
         oldest = min(near, key=lambda ref: ref.index)
-        self._kept = deque((ref for ref in self._kept if ref is not oldest), maxlen=self._kept.maxlen)
+        self._recent = deque((ref for ref in self._recent if ref is not oldest), maxlen=self._recent.maxlen)
         return self._use(oldest)
 
     def _use(self, ref: Reference) -> Reference:
-        if self._kept:
+        if self._recent:
             self.archive.add(self.newest)  # it changes no more
-        self._kept.append(ref)
-        while len(self._kept) > max(_RECENT, self._bytes / ref.device_bytes):
-            self._kept.popleft()
+        self._recent.append(ref)
+        while len(self._recent) > max(_RECENT, self._bytes / ref.device_bytes):
+            self._recent.popleft()
         if self._model is not None:
-            near = [k for k in self._kept if self._remoteness(ref.T_world_base, k.T_world_base) < _ANCHOR]
+            near = [k for k in self._recent if self._remoteness(ref.T_world_base, k.T_world_base) < _ANCHOR]
             oldest = min(near, key=lambda k: k.index)
             self.anchor = None if oldest is ref else oldest
         return ref
@@ -180,7 +180,7 @@ class SurfaceModel:
         """A keyframe as `KeyframeMaker.rectified` makes it, averaged with the model by variance, holes filled by it.
 
         What its depth scatters about the model's is taken as its noise, which grows with z². The model's own error is a
-        part of a voxel: where frames are more exact than that, they are believed.
+        part of a voxel: where frames are more exact than that, their depth is used.
         """
         made = self._maker.rectified(index, depth, colors, spline, older, as_now)
         if not self.volume.blocks:

@@ -1,8 +1,8 @@
 """Average colour in a rectified keyframe: rolling-shutter lookup, occlusion, weights that know about motion blur.
 
-Every pixel of the keyframe with depth is a point; a frame shows it where equation (3) says, at its own line's pose of
-mid-exposure. Frames count by equation (13) (Kerl, Stückler, Cremers, ICCV 2015): w = exp(−‖x_t − x_{t−t_e}‖ / σ²) with
-the distance in px that the point moves in the image while its line is exposed.
+Every pixel of the keyframe with depth is a point; a frame shows it where equation (3) puts it, at the pose of its line
+at mid-exposure. Frames count by equation (13) (Kerl, Stückler, Cremers, ICCV 2015): w = exp(−‖x_t − x_{t−t_e}‖ / σ²)
+with the distance in px that the point moves in the image while its line is exposed.
 
 fusion = ColorFusion(engine())
 fused = fusion.start(keyframe)
@@ -93,7 +93,7 @@ class ColorFusion:
     ) -> FusedColor:
         """With one more colour image averaged in where it shows the keyframe's points.
 
-        depth: the depth image nearest in time, which tells what hides them; what it does not know hides nothing.
+        depth: the depth image nearest in time, which shows what hides them; unknown depth hides nothing.
         spline: T_world_depth(t) in the world of `ref`, known over the lines of both images.
         """
         e = self.e
@@ -175,7 +175,7 @@ def _taps(f: Any) -> tuple[Any, ...]:
 class _AddInput:
     """Device arrays: the keyframe's inverse depth, fused colour and weight; the image (interleaved linear RGB).
 
-    depth: the image that tells what is hidden. *from_base: poses of both images' lines. sweep: see `sweep_table`.
+    depth: the image that shows what is hidden. *from_base: poses of both images' lines. sweep: see `sweep_table`.
     constants: 1/σ² (0: constant weights), least weight, largest sum of weights.
     """
 

@@ -34,7 +34,7 @@ SEARCH_S = 0.1
 
 _COARSE_S, _FINE_S, _FINE_REACH_S = 4e-3, 1e-3, 20e-3
 LEAST_PAIRS = 30
-"""Pairs of poses one second apart below which nothing is said."""
+"""Pairs of poses one second apart below which there is no fit."""
 
 # Resampled curves, and the length of what is resampled as one piece: errors of overlapping seconds are alike.
 _RESAMPLES, _BLOCK_S = 200, 2.0
@@ -96,7 +96,7 @@ def fit_clock(truth: Truth, estimate: Estimate, seed: int = 0) -> ClockFit:
     if not least:
         raise UserError(
             f"estimate: its errors have no minimum within {1e3 * SEARCH_S:g} ms of clock offset: give the offset in "
-            "seconds, or mend the track first"
+            "seconds, or repair the track first"
         )
     sigma = {name: errors.deviation(c, least[name], seed) for c, name in enumerate(CRITERIA) if name in least}
     best = min((name for name in CRITERIA if name in least), key=lambda name: sigma[name])
@@ -138,8 +138,8 @@ class _Errors:
         known = np.zeros(len(estimate.stamps), int)
         for tau in offsets:
             known[true_poses(truth.motion, estimate.stamps + tau, interpolate=True)[0]] += 1
-        kept = known == len(offsets)
-        stamps, T_est = estimate.stamps[kept], estimate.T_world_depth[kept]
+        compared = known == len(offsets)
+        stamps, T_est = estimate.stamps[compared], estimate.T_world_depth[compared]
         i, j = pairs_one_second_apart(stamps)
         if len(i) < LEAST_PAIRS:
             raise UserError(

@@ -47,7 +47,7 @@ _SHUTTERS = {"rs": "the rolling-shutter model", "gs": "taking the shutter for a 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Errors of one estimate; None where they cannot be had (`notes` says why).
+    """Errors of one estimate; None where they cannot be had (`notes` has the reason).
 
     frames, frames_tracked: of the sequence, and those among them with a pose within 0.02 s. poses, poses_compared: of
     the estimate, and those with a true counterpart. ate_*: absolute trajectory error. rpe_*: relative pose error over
@@ -119,7 +119,7 @@ class Metrics:
         return Table(head, tuple(texts), "Errors against the true trajectory, after rigid alignment", words=(0, 6))
 
     def text(self) -> str:
-        """The table, what it is of, and what has to be said about it."""
+        """The table, what it is of, and the notes."""
         tracked = f"{self.frames_tracked} of {self.frames} ({100 * self.coverage:.1f} %)"
         head = [f"frames tracked: {tracked}", ""] if self.frames else []
         notes = [f"note: {note}" for note in self.notes]

@@ -33,7 +33,7 @@ TruthExtrinsics = Literal["auto"]
 # Motions of one second must turn the camera this much, degrees RMS, about every axis that the fit needs.
 _LEAST_TURN_DEG = 2.0
 _ROUNDS = 4
-# Scales of residuals that are not told from zero, m and rad.
+# Scales of residuals that do not differ from zero, m and rad.
 _EXACT = 1e-9
 
 

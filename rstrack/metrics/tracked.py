@@ -42,7 +42,7 @@ class Tracked:
 
     @property
     def begin_s(self) -> float:
-        """Stamp of the first frame, s; of the first pose where the run does not tell its frames."""
+        """Stamp of the first frame, s; of the first pose where the run does not list its frames."""
         return float(self.frames[0]["stamp"] if self.frames else self.estimate.stamps[0])
 
     @property
@@ -104,7 +104,7 @@ def _dataset(
     recorded = estimate.info.get("dataset")
     path = recorded.get("path") if isinstance(recorded, dict) else None
     if not isinstance(path, str):
-        notes.append("The run does not say where its sequence is, so there are no errors and no images: name it with "
+        notes.append("The run does not state where its sequence is, so there are no errors and no images: name it with "
                      "--sequence.")  # fmt: skip
         return None
     try:

@@ -101,7 +101,7 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
     if all(track.succession.is_unfit(f) for f in recent):
         return _begin_anew(track, new)  # none of them has a colour image to go on with
     if not _leave(track, window):
-        track.keyframes.forget_first()
+        track.keyframes.drop_first()
         return _begin_anew(track, new)
     return track.report(new, fresh, solved, keyframe=True)
 

@@ -151,7 +151,7 @@ class Tracker:
 
     def all_keyframes(self) -> Archive:
         """All rectified keyframes, the newest put away with them."""
-        self._track.keyframes.put_away()
+        self._track.keyframes.archive_newest()
         return self._track.keyframes.archive
 
     @property

@@ -178,10 +178,10 @@ class BlockValues:
         if blocks <= have:
             return
         room = have * 2 ** int(np.ceil(np.log2(blocks / have)))
-        kept = dr.arange(self._e.UInt, have * POINTS)
+        filled = dr.arange(self._e.UInt, have * POINTS)
         for i, old in enumerate(self.sums):
             grown = self._zeros(room)
-            dr.scatter(grown, old, kept)
+            dr.scatter(grown, old, filled)
             dr.eval(grown)
             self.sums[i] = grown
 
@@ -204,7 +204,7 @@ class FarBlocks:
         self._places: dict[int, int] = {}
 
     def __len__(self) -> int:
-        """Blocks that have been here at some time: their places are kept."""
+        """Blocks that have been here at some time: their places stay."""
         return len(self._places)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""Device kernels of the signed distance volume: distances' scale, blocks in sight, integration, ray casting.
+"""Device kernels of the signed distance volume: distances' scale, visible blocks, integration, ray casting.
 
 Lattice point (i, j, k) lies at (i, j, k) times the voxel's size in the world. A block holds 8×8×8 lattice points; the
-directory, a dense table over a box of blocks about the camera, says where each block's values begin, -1 for blocks that
-are not there. Kept are sums over frames: of weights, of weights times truncated distances (in units of the truncation),
-and of weights times colours.
+directory, a dense table over a box of blocks about the camera, holds where each block's values begin, -1 where there is
+none. Stored are sums over frames: of weights, of weights times truncated distances (in units of the truncation), and of
+weights times colours.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _HEAVIEST = 2.5
 # Voxels from the surface within which lattice points take its colour.
 _COLORED = 2.0
 _SECANT_STEPS = 5
-# Voxels: how far from zero the distance may be where a ray is said to hit.
+# Voxels: how far from zero the distance may be where a ray hits.
 _HIT = 0.1
 _MOST_STEPS = 4096
 
@@ -72,7 +72,7 @@ def scale_kernel(e: Engine, lens: Lens) -> Callable[..., Any]:
     return kernel
 
 
-def sight_kernel(e: Engine, lens: Lens, band_m: float, voxel_m: float) -> Callable[..., Any]:
+def visible_blocks_kernel(e: Engine, lens: Lens, band_m: float, voxel_m: float) -> Callable[..., Any]:
     """Kernel (inverse_depth, T_world_cam (12), box (6)) → per part of the band: directory entries, and which count.
 
     box: the directory's first block (3) and its size in blocks (3), x y z.

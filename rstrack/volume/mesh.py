@@ -132,7 +132,7 @@ def _march(tsdf: Float32Array, known: npt.NDArray[np.bool_]) -> tuple[Float32Arr
     try:
         vertices, faces, _, _ = marching_cubes(tsdf, 0.0, mask=mask, gradient_direction="ascent")
     except (RuntimeError, ValueError):
-        return None  # what it says where the level is only touched
+        return None  # raised where the level is only touched
     return vertices, np.asarray(faces, np.int64)
 
 

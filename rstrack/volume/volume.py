@@ -30,11 +30,11 @@ from rstrack.volume.kernels import (
     integrate,
     raycast_kernel,
     scale_kernel,
-    sight_kernel,
+    visible_blocks_kernel,
 )
 
 TRUNCATION = 4.0
-"""Voxels to both sides of a surface within which distances are kept."""
+"""Voxels to both sides of a surface within which distances are stored."""
 
 _NEAR_M = 0.05
 # Of the distance that a ray is followed, where the window cannot hold all that it might cross.
@@ -115,7 +115,7 @@ class Volume:
         no room for the file.
         """
         _check(T_world_cam, lens)
-        entries = self._sighted(inverse_depth, T_world_cam, lens)
+        entries = self._visible(inverse_depth, T_world_cam, lens)
         if not len(entries):
             return
         e = self.e
@@ -165,7 +165,7 @@ class Volume:
     def _edge_m(self) -> float:
         return BLOCK * self.voxel_m
 
-    def _sighted(self, inverse_depth: Any, T_world_cam: FloatArray, lens: Lens) -> IntArray:
+    def _visible(self, inverse_depth: Any, T_world_cam: FloatArray, lens: Lens) -> IntArray:
         """Places (n,) in the window's table of the blocks around the depth image's surfaces, all of them made."""
         nearest = float(dr.min(dr.select(inverse_depth > 0.0, inverse_depth, dr.inf))[0])
         if not np.isfinite(nearest):
@@ -196,7 +196,7 @@ class Volume:
     def _marked(self, inverse_depth: Any, T_world_cam: FloatArray, lens: Lens) -> tuple[IntArray, IntArray]:
         """Places in the table of the blocks around a depth image's surfaces, and of those there are none of yet."""
         e, table = self.e, self._directory.table.reshape(-1)
-        kernel = self._kernel(sight_kernel, lens, self.truncation_m, self.voxel_m)
+        kernel = self._kernel(visible_blocks_kernel, lens, self.truncation_m, self.voxel_m)
         marks = dr.zeros(e.UInt, table.size)
         for entry, active in kernel(inverse_depth, *self._from_nearby(T_world_cam)):
             dr.scatter(marks, e.UInt(1), entry, active)

@@ -95,7 +95,7 @@ def test_to_begin_anew_keeps_the_scale_if_it_is_told_to(state: SplineState) -> N
     for keep, sigma in ((True, 0.7), (False, 0.03)):
         sight, terms = seen(), PoseTerms(next_sigma=0.7)
         sight.linearise(terms, state, 1)  # type: ignore[arg-type]
-        sight.forget(state, keep_sigma=keep)
+        sight.restart(state, keep_sigma=keep)
         assert not sight.is_linearised
         sight.linearise(terms, state, 0)  # type: ignore[arg-type]
         assert terms.calls == [(1, 0.03), (0, sigma)]

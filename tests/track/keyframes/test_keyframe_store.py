@@ -112,7 +112,7 @@ def make(kept: KeyframeStore, index: int, pose: np.ndarray, older: Any = None) -
 
 def recent(kept: KeyframeStore) -> list[Any]:
     """The last eight, newest first."""
-    return list(kept._kept)[:-9:-1]
+    return list(kept._recent)[:-9:-1]
 
 
 def test_without_a_model_the_last_eight_are_kept_and_none_is_returned_to() -> None:
