@@ -1,4 +1,4 @@
-"""What is unknown of every colour image beside its pose: gain and offset against its reference.
+"""What is unknown of every colour image beside its pose: gain and offset against its reference, in equation (8).
 
 Cameras expose as they like: I_image = I_ref + gain (I_ref − ½) + offset. The two are eliminated from the image's normal
 equations (Schur complement), so that the control points are solved for jointly with them: alternation converges slowly.

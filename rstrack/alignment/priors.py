@@ -1,4 +1,4 @@
-"""What is known of a motion beside the images: small accelerations, and the gauge."""
+"""What is known of a motion beside the images and added to equation (12): small accelerations, and the gauge."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The spline while it grows and moves."""
+"""The spline, equation (4), while it grows and moves."""
 
 from __future__ import annotations
 

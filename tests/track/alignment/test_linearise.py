@@ -247,15 +247,6 @@ def test_what_lies_behind_the_keyframes_surface_is_hidden_and_no_misfit() -> Non
     assert front < 0.6 * front_of and behind == behind_of and behind == pytest.approx(front, rel=0.02)
 
 
-def test_intensities_beyond_the_gate_are_left_out() -> None:
-    s = frontal("photometric")
-    assert isinstance(s.image, ColorImage)
-    everything = s.term(s.truth, 0.02).count
-    for off, count in ((0.29, everything), (0.31, 0)):
-        brighter = replace(s.image, levels=tuple(ENGINE.Float(level) + off for level in s.image.levels))
-        assert replace(s, image=brighter).term(s.truth, 0.02).count == count
-
-
 @pytest.mark.parametrize(("sigma", "limit"), [(8e-3, 2e-3), (1e-4, 1.25e-3)])  # f = 48 px: 5e-3 m credible
 def test_pixels_whose_interpolation_errs_by_more_than_a_quarter_of_sigma_weigh_less(sigma: float, limit: float) -> None:
     s = frontal()

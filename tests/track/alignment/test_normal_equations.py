@@ -10,6 +10,7 @@ from util import numeric_jacobian, random_spline
 from rsgen.geometry import se3
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.normal_equations import (
+    AndersonMixing,
     Quadratic,
     Slopes,
     assemble,
@@ -64,10 +65,10 @@ def test_jacobians_worked_out_together_are_as_each_is_alone() -> None:
 
 def test_chain_equals_the_sum_over_blocks() -> None:
     rng, spline, T = np.random.default_rng(1), random_spline(4), se3.exp(np.full(6, 0.2))
-    sums = random_sums(rng, len(TIMES), 1)
+    sums, own = random_sums(rng, len(TIMES), 1), rng.normal(size=(len(TIMES), 1, 6, 3))
     slopes = Slopes.of(spline, T, TIMES, None)
-    model, coupling = chain(sums, slopes)
-    assert (model.first, model.last) == (0, 7) and slopes.current.shape == (6, 6, 42) and coupling.shape == (42, 0)
+    model, coupling = chain(sums, slopes, own)
+    assert (model.first, model.last) == (0, 7) and slopes.current.shape == (6, 6, 42)
     J = line_jacobian(spline, T, TIMES, 0, 7)
     np.testing.assert_array_equal(slopes.current, J)
     H = sum(J[i].T @ sums.H[i, 0] @ J[i] for i in range(6))
@@ -75,20 +76,9 @@ def test_chain_equals_the_sum_over_blocks() -> None:
     np.testing.assert_allclose(model.H, H, atol=1e-11 * np.abs(H).max())
     np.testing.assert_allclose(model.g, g, atol=1e-11 * np.abs(g).max())
     np.testing.assert_array_equal(model.H, model.H.T)
-
-
-def test_the_coupling_is_chained_as_the_gradient_is() -> None:
-    rng, spline, T = np.random.default_rng(3), random_spline(4), se3.exp(np.full(6, 0.2))
-    sums, own = random_sums(rng, len(TIMES), 1), rng.normal(size=(len(TIMES), 1, 6, 3))
-    _, coupling = chain(sums, Slopes.of(spline, T, TIMES, None), own)
-    J = line_jacobian(spline, T, TIMES, 0, 7)
     np.testing.assert_allclose(coupling, sum(J[i].T @ own[i, 0] for i in range(6)), atol=1e-9)
-
-
-def test_chain_begins_at_the_first_control_point_that_is_touched() -> None:
-    rng, spline = np.random.default_rng(1), random_spline(4)
-    model, _ = chain(random_sums(rng, 2, 1), Slopes.of(spline, np.eye(4), TIMES[-2:], None))
-    assert (model.first, model.last, model.H.shape) == (2, 7, (30, 30))
+    late, _ = chain(random_sums(rng, 2, 1), Slopes.of(spline, np.eye(4), TIMES[-2:], None))
+    assert (late.first, late.last, late.H.shape) == (2, 7, (30, 30))
 
 
 def test_a_rolling_reference_moves_the_other_way() -> None:
@@ -166,12 +156,6 @@ def test_solution_equals_that_of_dense_algebra(points: int) -> None:
     np.testing.assert_allclose(H @ x, -g, rtol=1e-6, atol=1e-9 * np.abs(g).max())
 
 
-def test_a_wider_band_is_used_where_it_is_asked_for() -> None:
-    H, g = random_spd(np.random.default_rng(5), (), 60), np.ones(60)
-    np.testing.assert_allclose(solve(H, g, 60), -np.linalg.solve(H, g), rtol=1e-6)
-    assert np.abs(solve(H + 60 * np.eye(60), g, 24) + np.linalg.solve(H + 60 * np.eye(60), g)).max() > 1e-4
-
-
 @pytest.mark.parametrize("least", [0.0, -1.0])
 def test_a_system_without_a_minimum_is_refused(least: float) -> None:
     H = np.diag([*np.ones(11), least])
@@ -208,3 +192,61 @@ def test_a_system_that_rounding_made_indefinite_is_damped() -> None:
     np.testing.assert_allclose(told, -axes[:, 1:].T @ g / sizes[1:], rtol=0.05, atol=0.05)
     with pytest.raises(np.linalg.LinAlgError):
         solve_damped(H, np.full(60, np.nan), 60)
+
+
+# -- Anderson mixing -------------------------------------------------------------------------------------------------
+
+RNG = np.random.default_rng(4)
+A = RNG.normal(size=(12, 12))
+NORMAL = A @ A.T / 12 + 0.1 * np.eye(12)
+GOAL = RNG.normal(size=12)
+
+
+def iterations(H: np.ndarray, accelerated: bool, most: int = 5000) -> int:
+    """Steps with the Hessian H until the quadratic cost with the Hessian NORMAL is at its minimum."""
+    x, acceleration = np.zeros(12), AndersonMixing()
+    for n in range(most):
+        if np.linalg.norm(x - GOAL) < 1e-4:
+            return n
+        step = -np.linalg.solve(H, NORMAL @ (x - GOAL))
+        x = x + (acceleration.extrapolated(x, step, H) if accelerated else step)
+    return most
+
+
+def test_a_hessian_that_is_too_large_costs_a_third_of_the_steps() -> None:
+    noise = 8.0 * np.diag(np.abs(RNG.normal(size=12)))  # adds up in every direction, as squared noise of gradients does
+    plain = iterations(NORMAL + noise, accelerated=False)
+    assert plain > 100 and iterations(NORMAL + noise, accelerated=True) < plain // 3
+
+
+def test_one_slow_motion_is_found_in_two_more_steps() -> None:
+    d = np.linalg.eigh(NORMAL)[1][:, 0]
+    slow = NORMAL + 0.25 * np.outer(d, d)
+    assert iterations(slow, accelerated=False) > 20
+    assert iterations(slow, accelerated=True) <= 4
+
+
+def test_increments_may_be_moved_in_place_afterwards() -> None:
+    found = []
+    for in_place in (False, True):
+        at, acceleration = np.zeros(12), AndersonMixing()
+        for n in range(4):
+            given = at if in_place else at.copy()
+            step = acceleration.extrapolated(given, 0.9**n * np.linspace(0.1, 0.5, 12), NORMAL)
+            at += step
+        found.append(at)
+    np.testing.assert_array_equal(*found)
+
+
+def test_fast_steps_stay_as_they_are() -> None:
+    acceleration, step = AndersonMixing(), np.full(12, 0.5)
+    assert acceleration.extrapolated(np.zeros(12), step, NORMAL) is step
+    shorter = 0.2 * step
+    assert acceleration.extrapolated(step, shorter, NORMAL) is shorter
+
+
+def test_it_goes_four_times_as_far_as_the_plain_step_at_most() -> None:
+    acceleration, step = AndersonMixing(), np.full(12, 0.5)
+    acceleration.extrapolated(np.zeros(12), step, NORMAL)
+    further = acceleration.extrapolated(step, 0.99 * step, NORMAL)
+    np.testing.assert_allclose(further, 4.0 * 0.99 * step)

@@ -89,13 +89,3 @@ def test_what_is_hidden_is_told_once_at_the_finest_level(state: SplineState) -> 
     alone = seen()
     alone.linearise(terms, state, 0)  # type: ignore[arg-type]
     assert alone.image.shown is None and terms.visible_asked == 1  # type: ignore[union-attr]
-
-
-def test_to_begin_anew_keeps_the_scale_if_it_is_told_to(state: SplineState) -> None:
-    for keep, sigma in ((True, 0.7), (False, 0.03)):
-        sight, terms = seen(), PoseTerms(next_sigma=0.7)
-        sight.linearise(terms, state, 1)  # type: ignore[arg-type]
-        sight.restart(state, keep_sigma=keep)
-        assert not sight.is_linearised
-        sight.linearise(terms, state, 0)  # type: ignore[arg-type]
-        assert terms.calls == [(1, 0.03), (0, sigma)]

@@ -157,16 +157,6 @@ def test_what_is_predicted_takes_its_scale_from_the_finest_level_all_the_same() 
         assert shift_px(state.spline, aside(TRUTH, 0.004)) < 1e-4
 
 
-@pytest.mark.parametrize(("px", "is_kept"), [(0.0049, True), (0.0051, False)])
-def test_beside_a_prediction_settled_models_are_kept_for_a_quarter_of_the_pixels(px: float, is_kept: bool) -> None:
-    state = SplineState(TRUTH)
-    old, new = sighting(TIMES, TRUTH.pose(TIMES)), sighting(TIMES, aside(TRUTH, 2.0 * px).pose(TIMES))
-    old.linearise(PoseTerms(), state, 0)  # type: ignore[arg-type]
-    kept = old.linearisation
-    run(PoseTerms(), state, [new], state, [old], predicted=True)
-    assert (old.linearisation is kept) == is_kept
-
-
 # -- levels and stops --------------------------------------------------------------------------------------------------
 
 
@@ -192,13 +182,6 @@ def test_levels_go_from_coarse_to_fine_and_keep_the_scale() -> None:
         terms.calls.clear()
         run(terms, state, [sight], state, levels=(1, 0))
         assert terms.calls[0] == (1, 0.03)
-
-
-def test_there_are_no_more_steps_than_are_allowed() -> None:
-    state = start()
-    sight = sighting(TIMES, TRUTH.pose(TIMES))
-    done = optimise(PoseTerms(), state, problem([sight], state), (1, 0), (1, 2, 0))  # type: ignore[arg-type]
-    assert done.iterations == 3 and done.evaluations <= 3
 
 
 def test_control_points_that_are_not_free_stay() -> None:

@@ -10,22 +10,23 @@ from util import numeric_jacobian, random_spline, random_twists
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic, assemble, solve
-from rstrack.alignment.priors import acceleration_prior, pose_constraint, velocity_prior
+from rstrack.alignment.priors import acceleration_prior, acceleration_sigmas, pose_constraint, velocity_prior
 from rstrack.alignment.spline_state import SplineState
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_acceleration_prior_is_that_of_its_cost(seed: int) -> None:
+@pytest.mark.parametrize("of", ["acceleration", "velocity"])
+@pytest.mark.parametrize("seed", range(2))
+def test_motion_priors_are_those_of_their_costs(seed: int, of: str) -> None:
     spline, rng = random_spline(seed), np.random.default_rng(seed)
     first, last = 2, 8
-    sigma = rng.uniform(0.5, 2.0, (last - first - 2, 6))
+    sigma = rng.uniform(0.5, 2.0, (last - first - 2, 6) if of == "acceleration" else 6)
 
     def errors(x: np.ndarray) -> np.ndarray:
         T = moved(spline, x.reshape(-1, 6), first).control_points[first:last]
         omega = se3.log(np.linalg.inv(T[:-1]) @ T[1:])
-        return ((omega[1:] - omega[:-1]) / sigma).ravel()
+        return ((omega[1:] - omega[:-1] if of == "acceleration" else omega) / sigma).ravel()
 
-    model, cost = acceleration_prior(spline, first, last, sigma)
+    model, cost = (acceleration_prior if of == "acceleration" else velocity_prior)(spline, first, last, sigma)
     assert cost == pytest.approx(0.5 * (errors(np.zeros(36)) ** 2).sum())
     assert (model.first, model.last) == (first, last)
     J = numeric_jacobian(errors, 6 * (last - first))
@@ -34,28 +35,18 @@ def test_acceleration_prior_is_that_of_its_cost(seed: int) -> None:
     assert np.abs(model.g).max() > 0.1
 
 
+def test_the_ends_of_a_spline_are_held_tighter() -> None:
+    sigma = acceleration_sigmas(np.full(6, 4.0), 0.5, 7, last=1)
+    np.testing.assert_allclose(sigma[:, 0], [0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
+    assert (acceleration_sigmas(np.full(6, 4.0), 0.5, 3, 0, 0) == 1.0).all()
+
+
 def test_acceleration_prior_asks_nothing_of_constant_velocity() -> None:
     T = se3.exp(np.arange(8)[:, None] * np.array([0.1, -0.05, 0.2, 0.02, 0.1, -0.04]))
     model, cost = acceleration_prior(Spline(T, 0.0, 0.05), 0, 8, np.ones((6, 6)))
     assert cost < 1e-24
     assert np.abs(model.g).max() < 1e-12
     assert np.linalg.matrix_rank(model.H) == 36  # free: pose and velocity
-
-
-def test_velocity_prior_is_that_of_its_cost() -> None:
-    spline, first, last = random_spline(1), 2, 8
-    sigma = np.array([0.5, 0.6, 0.7, 1.0, 1.2, 1.4])
-
-    def errors(x: np.ndarray) -> np.ndarray:
-        T = moved(spline, x.reshape(-1, 6), first).control_points[first:last]
-        return (se3.log(np.linalg.inv(T[:-1]) @ T[1:]) / sigma).ravel()
-
-    model, cost = velocity_prior(spline, first, last, sigma)
-    assert cost == pytest.approx(0.5 * (errors(np.zeros(36)) ** 2).sum())
-    assert (model.first, model.last) == (first, last)
-    J = numeric_jacobian(errors, 6 * (last - first))
-    np.testing.assert_allclose(model.H, J.T @ J, atol=1e-6 * np.abs(J.T @ J).max())
-    np.testing.assert_allclose(model.g, J.T @ errors(np.zeros(36)), atol=1e-7 * np.abs(model.g).max())
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 0.3])

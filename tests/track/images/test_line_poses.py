@@ -15,7 +15,6 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import (
-    IDENTITY_FROM_BASE,
     Exposure,
     from_base_table,
     line_twists,
@@ -130,11 +129,6 @@ def test_a_global_shutter_has_one_line_whose_pose_is_that_of_the_spline() -> Non
     np.testing.assert_allclose(twist, velocity, atol=1e-15)
 
 
-def test_blocks_that_do_not_fill_up_have_their_middle() -> None:
-    image = Exposure(Lens(Camera(30, 20, 30.0, 30.0, 15.0, 10.0), Shutter(0.02)), 0.0, np.eye(4))
-    np.testing.assert_allclose(image.block_times(8), np.array([3.5, 11.5, 17.5]) * 0.001)
-
-
 @pytest.mark.parametrize("scan", SCANS)
 def test_tables_hold_each_lines_camera_in_the_base_frame_and_its_twist(scan: Scan) -> None:
     spline, image = hand_held(6), exposure(scan)
@@ -150,10 +144,3 @@ def test_tables_hold_each_lines_camera_in_the_base_frame_and_its_twist(scan: Sca
     delay = image.lens.shutter.line_delay(image.lens.camera)
     later = spline.pose(image.times()[k] + np.array([-0.5, 0.5]) * delay) @ np.linalg.inv(T_COLOR_DEPTH)
     np.testing.assert_allclose(from_base[k, 12:], se3.log(np.linalg.inv(later[0]) @ later[1]), atol=1e-9)
-
-
-def test_a_camera_that_is_its_own_base_and_rests_has_the_identity_table() -> None:
-    spline = Spline(np.repeat(se3.exp(np.full(6, 0.3))[None], 5, axis=0), 0.0, 0.5)
-    image = Exposure(Lens(CAMERA, Shutter(0.0, 0.004)), STAMP, np.eye(4))
-    table = from_base_table(spline, spline.pose(STAMP), image)
-    np.testing.assert_allclose(table, IDENTITY_FROM_BASE, atol=1e-15)

@@ -103,11 +103,6 @@ def test_a_tracker_with_hardly_any_memory_finds_the_same() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-def test_memory_is_checked() -> None:
-    with pytest.raises(UserError, match="memory_gb"):
-        Options(memory_gb=0.0)
-
-
 def plain_correlation(a: np.ndarray, b: np.ndarray) -> float:
     both = (a != 0) & (b != 0)
     if both.sum() < 0.25 * both.size or not np.ptp(a[both]) or not np.ptp(b[both]):

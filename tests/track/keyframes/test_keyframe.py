@@ -15,10 +15,9 @@ from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.images.line_poses import Exposure
-from rstrack.images.pyramid import LEVELS, depth_image, depth_resolution, intensity, masked_pyramid, pyramid
-from rstrack.images.sampling import EDGE, NEAREST
+from rstrack.images.pyramid import LEVELS, depth_image, depth_resolution, intensity, masked_pyramid
+from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import (
-    depth_scaling,
     level_points,
     on_one_surface,
     strides,
@@ -123,17 +122,6 @@ def test_a_pyramid_over_holes_is_normalised_convolution() -> None:
         np.testing.assert_allclose(c[known], 0.7, rtol=1e-5)
 
 
-def test_pyramids_halve_to_every_second_pixel() -> None:
-    ramp = np.add.outer(2.0 * np.arange(24), 3.0 * np.arange(33)).astype(np.float32)
-    for level, image in enumerate(pyramid(ramp)):
-        inner = image[3:-3, 3:-3]
-        scale = 2**level
-        want = np.add.outer(2.0 * scale * np.arange(image.shape[0]), 3.0 * scale * np.arange(image.shape[1]))[
-            3:-3, 3:-3
-        ]
-        np.testing.assert_allclose(inner, want, atol=1e-3)
-
-
 def test_points_of_all_levels_lie_on_the_surface() -> None:
     camera, m = camera_of("radtan"), (0.1, -0.05, 0.5)
     rays = camera.unproject(camera.pixel_grid())[..., :2]
@@ -158,16 +146,6 @@ def test_points_of_all_levels_lie_on_the_surface() -> None:
         assert points.bound > steepest
         inner = value[on & (np.add.outer(np.arange(shape[0]) * stride, np.zeros(shape[1])) > 60)]
         assert len(inner) and 0.0 < inner.min() < inner.max() < 1.0
-
-
-def test_scaling_of_depth_is_its_median() -> None:
-    rho = np.array([[0.0, 1.0, 0.5], [0.25, 0.5, 0.1]], np.float32)
-    median_depth, bound = depth_scaling(rho)
-    assert median_depth == pytest.approx(2.0)
-    z = np.linspace(0.1, 20.0, 1000)
-    even = np.minimum((median_depth / z) ** 2, NEAREST)
-    assert (even * np.maximum(1.0, np.sqrt(2.0) * z / median_depth)).max() < bound < 4 * NEAREST
-    assert depth_scaling(np.zeros((2, 2), np.float32)) == (1.0, bound)
 
 
 def test_resolution_of_whole_disparities_is_found() -> None:

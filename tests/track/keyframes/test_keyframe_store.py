@@ -158,16 +158,6 @@ class ByDistance(Options):
         return abs(float(T_base_cam[0, 3])) / self.keyframe_distance
 
 
-def test_a_model_keeps_256_of_which_the_last_eight_are_recent(models: list[Model]) -> None:
-    kept = KeyframeStore(Maker(), ByDistance(reference="model"))  # type: ignore[arg-type]
-    refs = [make(kept, k, at(10.0 * k)) for k in range(260)]
-    assert len(kept) == 256 and kept.made == 260
-    assert recent(kept) == refs[:251:-1]
-    assert all(ref.made_by == "model" for ref in refs) and models[0].added == [f"depth {k}" for k in range(260)]
-    # The first four are forgotten.
-    assert kept.return_to(at(30.0), refs[-1]) is None and kept.return_to(at(40.0), refs[-1]) is refs[4]
-
-
 @pytest.mark.parametrize(
     ("pose", "is_near"),
     [

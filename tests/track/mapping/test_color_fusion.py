@@ -257,12 +257,6 @@ def test_what_was_hidden_from_the_older_keyframe_inherits_nothing() -> None:
     assert (weight[has][inside & (free > 0.999)] > 0).mean() > 0.85
 
 
-def test_light_and_code_values_are_inverse() -> None:
-    byte = np.arange(256, dtype=np.float32)
-    assert np.array_equal(np.rint(255 * encode(decode(byte / np.float32(255)))), byte)
-    assert decode(np.array(0.5)) == pytest.approx(0.214041, abs=1e-6)  # IEC 61966-2-1
-
-
 def test_the_sweep_is_the_motion_of_the_lines_camera() -> None:
     image = color_exposure(0.44, 0.02)
     times = image.times()

@@ -126,26 +126,6 @@ def test_the_same_frames_give_the_same_bits_and_no_more_blocks() -> None:
     assert (a.blocks, a.bytes) == (blocks, size)
 
 
-def test_memory_is_spent_on_the_surface_only() -> None:
-    volume = Volume(ENGINE, 0.02)
-    volume.integrate(inverse(np.full(SHAPE, 2.0)), np.eye(4), LENS)
-    edge = 0.02 * BLOCK
-    face = (2.0 * SHAPE[1] / LENS.camera.fx / edge + 2) * (2.0 * SHAPE[0] / LENS.camera.fy / edge + 2)
-    assert volume.blocks <= 2 * face
-
-
-def test_a_volume_grows_beyond_its_first_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    T = POSES[0]
-    kept, _ = filled().raycast(T, LENS)
-    monkeypatch.setattr("rstrack.volume.blocks._FIRST_BLOCKS", 16)
-    volume = filled()
-    far = np.eye(4)
-    far[:3, 3] = 5.0, -3.0, 0.0  # the directory grows too
-    volume.integrate(inverse(np.full(SHAPE, 2.5)), far, LENS)
-    assert volume.blocks > 2 * 16
-    np.testing.assert_array_equal(ENGINE.download(volume.raycast(T, LENS)[0], SHAPE), ENGINE.download(kept, SHAPE))
-
-
 def far_apart(n: int) -> list[np.ndarray]:
     """Poses along a long way, and back to the start."""
     out = []
