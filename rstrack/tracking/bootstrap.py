@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rstrack.alignment.observation import Observation
-from rstrack.alignment.score import Scores, scores
+from rstrack.alignment.observation import Observation, Scores, scores
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import Fault, FrameReport

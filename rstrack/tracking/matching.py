@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.observation import Observation
+from rstrack.alignment.observation import Observation, Scores, scores
 from rstrack.alignment.optimizer import Solved
-from rstrack.alignment.score import Scores, scores
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import DepthImage

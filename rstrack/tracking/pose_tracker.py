@@ -18,9 +18,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.rigid import Alignment, align
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.observation import Observation
+from rstrack.alignment.observation import Observation, scores
 from rstrack.alignment.optimizer import Solved
-from rstrack.alignment.score import scores
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig

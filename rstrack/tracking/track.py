@@ -12,10 +12,9 @@ from rsgen.array_types import FloatArray
 from rstrack.adjustment.chain import Chain
 from rstrack.alignment.free_space import FreeSpace
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.observation import Observation, observe
+from rstrack.alignment.observation import Observation, Scores, observe
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.priors import ACCELERATION
-from rstrack.alignment.score import Scores
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import Independence
 from rstrack.data.imu.recording import ImuRecording

@@ -18,8 +18,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.alignment.observation import Observation
-from rstrack.alignment.score import steady
+from rstrack.alignment.observation import Observation, steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import CALIBRATION_NAMES
 from rstrack.tracking.judgement.consider import CLOCK, COUNT, Calibration

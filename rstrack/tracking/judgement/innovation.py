@@ -23,8 +23,7 @@ from scipy.special import chdtri
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.observation import Observation
-from rstrack.alignment.score import steady
+from rstrack.alignment.observation import Observation, steady
 from rstrack.alignment.spline_state import SplineState
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors, Considered
 from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX, Systematic, Uncertainty, of_pixels

@@ -10,8 +10,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.observation import Observation
-from rstrack.alignment.score import Scores
+from rstrack.alignment.observation import Observation, Scores
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference

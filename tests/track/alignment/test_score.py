@@ -11,9 +11,8 @@ from pose_terms import PoseTerms, sighting
 from rstrack_util import hand_held
 
 from rsgen.geometry import se3
-from rstrack.alignment import score
-from rstrack.alignment.observation import Observation
-from rstrack.alignment.score import Scores, scores
+from rstrack.alignment import observation as score
+from rstrack.alignment.observation import Observation, Scores, scores
 from rstrack.alignment.spline_state import SplineState
 
 TRUTH = hand_held(3)

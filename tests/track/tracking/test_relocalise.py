@@ -11,8 +11,8 @@ import pytest
 from rstrack_util import hand_held
 
 from rsgen.geometry import se3
+from rstrack.alignment.observation import Scores
 from rstrack.alignment.optimizer import Solved
-from rstrack.alignment.score import Scores
 from rstrack.images.pyramid import DepthImage
 from rstrack.tracking import matching
 from rstrack.tracking.frame_report import Fault
