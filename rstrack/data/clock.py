@@ -1,8 +1,7 @@
 """The clock behind a stream's stamps: what drivers write are times of arrival, and cameras expose at even intervals.
 
-clock = estimate_clock(stamps)                # period, jitter, dropped and repeated images
-stamps = regular(stamps)                      # when the images of that clock were taken
-live = RunningClock(); live.feed(stamp)       # the same, causal
+clock, even = straightened(stamps)        # period, jitter, dropped images; when the images of that clock were taken
+live = RunningClock(); live.feed(stamp)   # the same, causal
 
 A stream's images are counted (each is a whole number of periods after the one before), and a line, or over minutes a
 slow curve, is fitted through stamps against counts. Arrival is late or early by a mix of polling and load. Where the
@@ -22,12 +21,9 @@ from scipy.interpolate import BSpline
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import spsolve
 
-from rsgen.array_types import FloatArray
-
-__all__ = ["RunningClock", "StampClock", "drift_ppm", "estimate_clock", "regular", "straightened"]
+from rsgen.array_types import FloatArray, IntArray
 
 Verdict = Literal["regular", "jittered", "irregular", "too short"]
-IntArray = npt.NDArray[np.int64]
 
 # Rounding of stamps to four decimals has 29 µs RMS. A sensor's own line timing is steadier than that by far.
 _REGULAR_S = 50e-6
@@ -69,17 +65,6 @@ class StampClock:
     verdict: Verdict
 
 
-def estimate_clock(stamps: npt.ArrayLike) -> StampClock:
-    """The clock of stamps (n,) in seconds, not decreasing."""
-    return straightened(stamps)[0]
-
-
-def regular(stamps: npt.ArrayLike) -> FloatArray:
-    """Stamps (n,) in seconds as the clock behind them has them; unchanged where they are regular, or have no clock."""
-    clock, even = straightened(stamps)
-    return even if clock.verdict == "jittered" else np.asarray(stamps, np.float64)
-
-
 def drift_ppm(clock: StampClock, other: StampClock) -> float | None:
     """Parts per million by which a clock runs fast against another stream's.
 
@@ -104,12 +89,11 @@ def straightened(stamps: npt.ArrayLike) -> tuple[StampClock, FloatArray]:
         period = float(np.median(steps)) if len(steps) else 0.0
         return StampClock(len(t), period, float(t[0]) if len(t) else 0.0, 0.0, 0.0, 0, 0, "too short"), t
     # Most steps are one period; where more than half are two, because images were dropped, the short ones decide.
-    guesses = [np.median(steps[steps > 0]), np.quantile(steps[steps > 0], 0.1)]
-    found = _with_period(t, float(guesses[0]))
-    if found[0].verdict == "irregular":
-        other = _with_period(t, float(guesses[1]))
-        found = found if other[0].verdict == "irregular" else other
-    return found
+    found = _with_period(t, float(np.median(steps[steps > 0])))
+    if found[0].verdict != "irregular":
+        return found
+    other = _with_period(t, float(np.quantile(steps[steps > 0], 0.1)))
+    return found if other[0].verdict == "irregular" else other
 
 
 def _with_period(t: FloatArray, guess: float) -> tuple[StampClock, FloatArray]:
@@ -126,7 +110,9 @@ def _with_period(t: FloatArray, guess: float) -> tuple[StampClock, FloatArray]:
             continue
         on_clock, part_period = _on_clock(count, t[part], again)
         steady &= _is_steady(on_clock, count)
-        even[part] = on_clock + 0.01 * part_period * _runs(again)
+        index = np.arange(len(part))
+        in_a_row = (index - np.maximum.accumulate(np.where(again, 0, index))).astype(np.float64)  # repetitions
+        even[part] = on_clock + 0.01 * part_period * in_a_row
         periods.append(part_period)
         lengths.append(len(part))
     period = periods[int(np.argmax(lengths))]
@@ -172,12 +158,6 @@ def _counted(t: FloatArray, period: float) -> tuple[IntArray, npt.NDArray[np.boo
         count[i] = k
         phase += 0.05 * period * float(np.clip(offset - k, -0.25, 0.25)) if i else 0.0
     return count, again
-
-
-def _runs(again: npt.NDArray[np.bool_]) -> FloatArray:
-    """How many repetitions (n,) in a row each is."""
-    index = np.arange(len(again))
-    return (index - np.maximum.accumulate(np.where(again, 0, index))).astype(np.float64)
 
 
 def _on_clock(count: IntArray, t: FloatArray, again: npt.NDArray[np.bool_]) -> tuple[FloatArray, float]:
@@ -232,8 +212,8 @@ def _fit(A: csr_array, y: FloatArray, weight: FloatArray, edge: bool) -> FloatAr
 
 def _is_steady(even: FloatArray, count: IntArray) -> bool:
     """Whether the fitted clock keeps its rate as quartz does."""
-    steps = np.diff(even) / np.maximum(np.diff(count), 1)
-    steps = steps[np.diff(count) > 0]
+    counts = np.diff(count)
+    steps = np.diff(even)[counts > 0] / counts[counts > 0]
     return bool(np.ptp(steps) < 2.0 * _MOST_DRIFT * np.median(steps))
 
 
@@ -249,8 +229,7 @@ _LEAST_STEP = 0.05
 class RunningClock:
     """Straightens one stream's stamps (s), which must increase. The first few come back as they are.
 
-    A change of rate, or a pause, starts anew. In contrast to `regular` nothing is known of later stamps: the first
-    seconds are straightened less.
+    A change of rate, or a pause, starts anew. Later stamps are not known: the first seconds are straightened less.
     """
 
     _recent: list[float] = field(default_factory=list)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.files import listed_file, read_text
 from rsgen.geometry import se3
@@ -33,8 +33,6 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size, repeated
 from rstrack.data.layouts.recorded import RecordedFolder, find_camera_file, repeats_note
 from rstrack.data.rig import DEFAULT_SIGMA, Rig
-
-IntArray = npt.NDArray[np.int64]
 
 _NAME = re.compile(r"frame-(\d{1,9})\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
 _RATE_HZ = 30.0

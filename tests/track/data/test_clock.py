@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rstrack.data.clock import RunningClock, StampClock, drift_ppm, estimate_clock, regular, straightened
+from rstrack.data.clock import RunningClock, StampClock, drift_ppm, straightened
+from rstrack.data.timing import stream_timing
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 needs_rpy = pytest.mark.skipif(not (DATA / "tum_fr1_rpy").is_dir(), reason="../shared/data/tum_fr1_rpy is not here")
@@ -19,6 +20,11 @@ EPOCH = 1305031229.0
 def true_times(n: int, period: float = 1 / 30, ppm_per_minute: float = 0.0) -> np.ndarray:
     t = period * np.arange(n)
     return EPOCH + t + 0.5e-6 * ppm_per_minute / 60.0 * t**2
+
+
+def used(stamps: np.ndarray) -> np.ndarray:
+    """Those that images are tracked at, unless the user states otherwise."""
+    return stream_timing("depth", stamps, "auto", 0.0).used
 
 
 def without_mean(error: np.ndarray) -> np.ndarray:
@@ -53,10 +59,10 @@ def test_late_bursts_do_not_bend_the_line_and_both_kinds_of_jitter_are_met() -> 
     true = true_times(300)
     late = true + rng.uniform(0.0, 1e-3, 300)
     late[40:120] += rng.uniform(0.0, 6e-3, 80)  # the computer was busy for a while
-    assert without_mean(regular(late) - true).std() < 0.1e-3
+    assert without_mean(used(late) - true).std() < 0.1e-3
     around = true + rng.normal(0.0, 2e-3, 300)
     # A line through n stamps: σ √(1/12) of the slope's error over its ends.
-    assert without_mean(regular(around) - true).std() < 3.0 * 2e-3 / np.sqrt(300)
+    assert without_mean(used(around) - true).std() < 3.0 * 2e-3 / np.sqrt(300)
 
 
 def test_outliers_repeats_and_bunches() -> None:
@@ -72,7 +78,7 @@ def test_outliers_repeats_and_bunches() -> None:
     clock, even = straightened(np.concatenate([twice, stamps[60:]]))
     assert (clock.dropped, clock.repeated) == (20, 2)
     assert (np.diff(even) > 0).all()
-    assert estimate_clock(np.sort(np.concatenate([stamps[:40], stamps[[20]]]))).repeated == 1
+    assert straightened(np.sort(np.concatenate([stamps[:40], stamps[[20]]])))[0].repeated == 1
 
 
 def test_a_clock_that_warms_up_is_followed() -> None:
@@ -81,17 +87,17 @@ def test_a_clock_that_warms_up_is_followed() -> None:
     stamps = true + rng.uniform(0.0, 4e-3, len(true))
     line = np.polyval(np.polyfit(np.arange(54000), true - EPOCH, 1), np.arange(54000)) + EPOCH
     assert np.abs(line - true).max() > 3e-3, "a line would be wrong"
-    assert np.abs(without_mean(regular(stamps) - true)).max() < 0.3e-3
+    assert np.abs(without_mean(used(stamps) - true)).max() < 0.3e-3
 
 
 def test_what_is_regular_stays_bit_for_bit() -> None:
     rng = np.random.default_rng(6)
     for stamps in (np.round(true_times(200), 4), true_times(200), np.arange(1.0, 300.0) / 30.0):
-        assert estimate_clock(stamps).verdict == "regular"
-        np.testing.assert_array_equal(regular(stamps), stamps)
+        assert straightened(stamps)[0].verdict == "regular"
+        np.testing.assert_array_equal(used(stamps), stamps)
     for few in (np.empty(0), np.array([1.0]), true_times(19) + rng.normal(0.0, 1e-3, 19)):
-        assert estimate_clock(few).verdict == "too short"
-        np.testing.assert_array_equal(regular(few), few)
+        assert straightened(few)[0].verdict == "too short"
+        np.testing.assert_array_equal(used(few), few)
 
 
 @pytest.mark.parametrize("kind", ["uniform", "wander", "two rates", "exposure"])
@@ -104,8 +110,8 @@ def test_what_has_no_steady_clock_stays_raw(kind: str) -> None:
         "exposure": np.repeat(rng.uniform(0.033, 0.066, 20), 20),
     }[kind]
     stamps = EPOCH + np.cumsum(steps)
-    assert estimate_clock(stamps).verdict == "irregular"
-    np.testing.assert_array_equal(regular(stamps), stamps)
+    assert straightened(stamps)[0].verdict == "irregular"
+    np.testing.assert_array_equal(used(stamps), stamps)
 
 
 def test_half_the_rate_for_a_while_and_a_pause() -> None:
@@ -123,16 +129,16 @@ def test_half_the_rate_for_a_while_and_a_pause() -> None:
 
 def test_drift_against_another_clock() -> None:
     def clock(period: float) -> StampClock:
-        return estimate_clock(true_times(300, period))
+        return straightened(true_times(300, period))[0]
 
     depth = clock(1 / 30)
     assert drift_ppm(clock((1 / 30) / (1 + 990e-6)), depth) == pytest.approx(990, abs=0.1)
     assert drift_ppm(clock((1 / 15) * (1 + 50e-6)), depth) == pytest.approx(-50, abs=0.1)
     assert drift_ppm(clock(1 / 60), depth) == pytest.approx(0, abs=0.1)
     assert drift_ppm(clock(1 / 45), depth) is None
-    assert drift_ppm(estimate_clock([1.0]), depth) is None
+    assert drift_ppm(straightened([1.0])[0], depth) is None
     # A few stamps have a period, but tell no rate.
-    assert drift_ppm(estimate_clock(true_times(9, (1 / 30) / (1 + 990e-6))), depth) is None
+    assert drift_ppm(straightened(true_times(9, (1 / 30) / (1 + 990e-6)))[0], depth) is None
 
 
 @pytest.mark.parametrize("seed", range(3))

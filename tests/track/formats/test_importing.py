@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,6 +17,8 @@ from recordings import COLOR_K, COLOR_SIZE, COUNT
 from rsgen.cli.main import main as rsgen
 from rsgen.config.imu import ImuConfig
 from rsgen.geometry import se3
+from rsgen.image_codecs import encode_png
+from rstrack import formats
 from rstrack.cli.info import describe
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.own_intrinsics import SharedImages
@@ -184,3 +188,30 @@ def test_what_is_no_recording_is_said_to_be_none(place: Path, capfd: pytest.Capt
         refused(capfd, name, said)
     recordings.write_realsense(place / "rs.bag", CONTENT)
     refused(capfd, "rs.bag --device nothing", "realsense-d435")
+
+
+def test_the_reader_of_the_document_is_one_module_and_one_line(
+    place: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """docs/adding-a-format.md: its module runs by its line in the registry."""
+    text = (Path(__file__).parents[3] / "docs/adding-a-format.md").read_text().partition("## A recording")[2]
+    code, line = re.findall(r"^```python\n(.*?)^```$", text, flags=re.M | re.S)
+    module = ModuleType("rstrack.formats.frames_csv")
+    exec(code, module.__dict__)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(formats, "READERS", dict(formats.READERS))
+    exec(line, formats.__dict__)
+    folder = place / "mine"
+    folder.mkdir()
+    (folder / "camera.txt").write_text(" ".join(map(str, (*recordings.DEPTH_SIZE, *recordings.DEPTH_K))))
+    width, height = recordings.DEPTH_SIZE
+    for k, units in enumerate(CONTENT.units):
+        (folder / f"d{k}.png").write_bytes(encode_png(units))
+        (folder / f"c{k}.png").write_bytes(encode_png(np.full((height, width, 3), k, np.uint8)))
+    rows = [f"{ns},c{k}.png,d{k}.png" for k, ns in enumerate(CONTENT.depth_ns)]
+    (folder / "frames.csv").write_text("\n".join(rows))
+    dataset, said = imported(capfd, "mine")
+    assert "folder of frames.csv" in said and dataset.rig.is_registered and len(dataset) == COUNT
+    assert all((dataset.images.depth(k) == CONTENT.units[k] / np.float32(1000)).all() for k in range(COUNT))
+    (folder / "frames.csv").write_text("now,c0.png,d0.png")
+    refused(capfd, "mine --force", "expected", "frames.csv")
