@@ -44,7 +44,6 @@ from rstrack.data.timing import StampsMode
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
 _KEYS = "color, depth, T_color_depth, stamps, clocks and sigma, each camera with width, height, intrinsics, readout_s"
-
 _ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
 
 Size = tuple[int, int]
