@@ -215,3 +215,19 @@ def test_the_reader_of_the_document_is_one_module_and_one_line(
     assert all((dataset.images.depth(k) == CONTENT.units[k] / np.float32(1000)).all() for k in range(COUNT))
     (folder / "frames.csv").write_text("now,c0.png,d0.png")
     refused(capfd, "mine --force", "expected", "frames.csv")
+
+
+def test_metadata_of_any_shape(place: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_lzfse(monkeypatch)
+    for change in (
+        {"K": None}, {"K": [1] * 8}, {"poses": [[1]]}, {"poses": "x"}, {"frameTimestamps": ["x"] * 5},
+        {"perFrameIntrinsicCoeffs": [[1e400] * 4] * 5}, {"dw": 10**9, "dh": 10**9}, {"dw": -1},
+        {"fps": 0, "frameTimestamps": []},
+        {"frameTimestamps": [1e300] * 5}, {"K": [0.0] * 9, "perFrameIntrinsicCoeffs": []},
+    ):  # fmt: skip
+        recordings.write_r3d(place / "one.r3d", CONTENT, **change)
+        refused(capfd, "one.r3d", "one.r3d")
+    # Poses that are none are no truth, and no reason to refuse the rest.
+    odd = [[float("nan")] * 7, [0] * 7, [2, 0, 0, 0, 1, 1, 1], [0, 0, 0, 1, 1e300, 0, 0], [0, 0, 0, 1, 0, 0, 0]]
+    recordings.write_r3d(place / "one.r3d", CONTENT, poses=odd)
+    assert len(imported(capfd, "one.r3d")[0]) == COUNT

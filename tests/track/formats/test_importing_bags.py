@@ -190,3 +190,14 @@ def test_bags_without_rosbags_say_what_to_install(
     recordings.write_realsense(place / "rs.bag", CONTENT)
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
     refused(capfd, "rs.bag", "[ros]")
+
+
+@pytest.mark.parametrize(("name", "is_ros1", "storage"), [("packed.bag", True, "bz2"), ("two.mcap", False, "mcap")])
+def test_a_chunk_that_unpacks_to_too_much_is_refused(
+    place: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str, is_ros1: bool,
+    storage: str,
+) -> None:  # fmt: skip
+    talker = Talker(is_ros1)
+    recordings.write_spoken(place / name, talker, recordings.speak(talker, CONTENT), storage)
+    monkeypatch.setattr("rstrack.formats.bags.bag._MOST_CHUNK_BYTES", 1000)
+    refused(capfd, name, "unpacks to more than 1000 bytes")
