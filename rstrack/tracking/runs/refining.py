@@ -25,7 +25,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO, Estimate, write_estimate
 from rstrack.data.image_files import prefetched, with_noise
 from rstrack.data.rig import Frame
-from rstrack.inertial import record as imu_record
+from rstrack.inertial import estimate as inertial_estimate
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.consistency import HORIZONS_S, covariances, motion_covariance, motion_errors, step_nees
 from rstrack.metrics.evaluate import pairs_apart
@@ -128,9 +128,9 @@ def refine_run(
     poses = estimate.T_world_depth if kept else se3.orthonormalise(moved @ estimate.T_world_depth)
     imu = _NOT_LOOKED_AT if options.inertial else ""
     if refiner.imu is not None and refiner.found is not None and not kept:
-        imu_estimate = imu_record.estimate_dict(refiner.found.estimate, refiner.imu.sigma)
+        imu_estimate = inertial_estimate.estimate_dict(refiner.found.estimate, refiner.imu.sigma)
         info["imu"] = (estimate.info.get("imu") or {}) | imu_estimate | refiner.found.as_dict()
-        imu = f"{imu_record.refined_text(imu_estimate)}, {refiner.found.text(refiner.imu.recording.T_imu_depth)}"
+        imu = f"{inertial_estimate.refined_text(imu_estimate)}, {refiner.found.text(refiner.imu.recording.T_imu_depth)}"
     result = Estimate(estimate.stamps, poses, spline, info, estimate.moving)
     truth = truth_of(dataset)
     before, after = (evaluated(truth, each) for each in (estimate, result))

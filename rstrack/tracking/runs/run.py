@@ -27,7 +27,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.data.image_files import prefetched, with_noise
 from rstrack.data.rig import Frame
-from rstrack.inertial import record as imu_record
+from rstrack.inertial import estimate as inertial_estimate
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 from rstrack.tracking.first_look import looked_at
@@ -277,7 +277,7 @@ def _info(run: Run, closing: Closing | None, times: dict[str, float]) -> dict[st
     if found.color_late[1] > 0.0:
         info["color_late"] = dict(zip(("seconds", "sigma_s"), found.color_late, strict=True))
     if found.inertia is not None:
-        info["imu"] = imu_record.record(found.inertia)
+        info["imu"] = inertial_estimate.record(found.inertia)
     return info
 
 
@@ -285,7 +285,7 @@ def _imu_text(run: Run, info: dict[str, Any]) -> str:
     if "imu" not in info:
         return ""
     bridged = sum(report.bridged for report in run.tracker.reports)
-    return imu_record.text(info["imu"], run.dataset.stamps[run.chosen[0]], bridged)
+    return inertial_estimate.text(info["imu"], run.dataset.stamps[run.chosen[0]], bridged)
 
 
 def _closed(run: Run, end: End, progress: Progress) -> tuple[Closing | None, End]:
@@ -307,8 +307,8 @@ def _closed(run: Run, end: End, progress: Progress) -> tuple[Closing | None, End
 
 def _upright(estimate: Estimate, down: FloatArray) -> Estimate:
     """With z up, in whose world gravity was `down` (3,)."""
-    T_upright_world = imu_record.upright(down)
-    spline = None if estimate.spline is None else imu_record.turned(T_upright_world, estimate.spline)
+    T_upright_world = inertial_estimate.upright(down)
+    spline = None if estimate.spline is None else inertial_estimate.turned(T_upright_world, estimate.spline)
     return Estimate(estimate.stamps, T_upright_world @ estimate.T_world_depth, spline, estimate.info)
 
 

@@ -17,10 +17,9 @@ from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.estimate import SIZE, TURN, TURNED, ImuEstimate
+from rstrack.inertial.estimate import SIZE, TURN, TURNED, ImuEstimate, is_contradicted, record, text
 from rstrack.inertial.estimate import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.record import is_contradicted, record, text
 from rstrack.inertial.residuals import ImuReadings, ImuResiduals
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 

@@ -24,7 +24,7 @@ from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.inertial.band import MotionBand
-from rstrack.inertial.record import upright
+from rstrack.inertial.estimate import upright
 from rstrack.options import Options
 from rstrack.tracking.runs import checkpoint
 from rstrack.tracking.runs.run import track
