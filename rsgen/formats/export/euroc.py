@@ -79,7 +79,12 @@ def export_euroc(
     atomic_write(root / "body.yaml", encode_yaml(_body_yaml(sequence, imu.config if imu else None, epoch_s)))
     truth = truth_csv(sequence, times, T_depth_body, imu.samples if imu else None, epoch_s)
     atomic_write(root / _TRUTH / "data.csv", truth)
-    atomic_write(root / _TRUTH / "sensor.yaml", encode_yaml(_truth_yaml()))
+    truth_sensor = {
+        "sensor_type": "visual-inertial",
+        "comment": "rsgen: exact, from the spline",
+        "T_BS": _matrix(np.eye(4)),
+    }
+    atomic_write(root / _TRUTH / "sensor.yaml", encode_yaml(truth_sensor))
     if imu:
         make_folders(root / "imu0")
         write_imu_csv(root / "imu0" / "data.csv", imu.samples, epoch_s)
@@ -150,10 +155,6 @@ def _imu_yaml(imu: ImuConfig) -> dict[str, Any]:
         "accelerometer_noise_density": imu.accelerometer_noise_density,
         "accelerometer_random_walk": imu.accelerometer_random_walk,
     }
-
-
-def _truth_yaml() -> dict[str, Any]:
-    return {"sensor_type": "visual-inertial", "comment": "rsgen: exact, from the spline", "T_BS": _matrix(np.eye(4))}
 
 
 def _body_yaml(sequence: Sequence, imu: ImuConfig | None, epoch_s: int) -> dict[str, Any]:

@@ -6,7 +6,6 @@ Names and checks after Kalibr's `kalibr_common/ConfigReader.py`; formats: its wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +94,8 @@ def camchain(sequence: Sequence, imu: SequenceImu | None) -> dict[str, Any]:
         T_depth_imu = imu.config.T_depth_imu()
         for name, stream, T_cam_depth in (("cam0", color, sequence.T_color_depth), ("cam1", depth, None)):
             T_cam_imu = T_depth_imu if T_cam_depth is None else T_cam_depth @ T_depth_imu
-            shift = row_clock(stream.name, stream.camera, stream.shutter).first_s + imu.faults.clock_offset_s
+            first_s, _ = row_clock(stream.name, stream.camera, stream.shutter)
+            shift = first_s + imu.faults.clock_offset_s
             cameras[name] |= {"T_cam_imu": _matrix(T_cam_imu), "timeshift_cam_imu": shift}
     return cameras
 
@@ -130,29 +130,24 @@ def _camera(stream: ImageStream, topic: str) -> dict[str, Any]:
         "distortion_coeffs": bent,
         "resolution": [camera.width, camera.height],
         "rostopic": topic,
-        "line_delay": row_clock(stream.name, camera, stream.shutter).delay_s,
+        "line_delay": row_clock(stream.name, camera, stream.shutter)[1],
     }
 
 
-@dataclass(frozen=True)
-class RowClock:
-    """When image row v is exposed: mid-exposure at stamp + first_s + v · delay_s; delay_s < 0 from bottom to top."""
+def row_clock(name: str, camera: Camera, shutter: Shutter) -> tuple[float, float]:
+    """first, delay in s: mid-exposure of image row v is at stamp + first + v · delay; delay < 0 from bottom to top.
 
-    first_s: float
-    delay_s: float
-
-
-def row_clock(name: str, camera: Camera, shutter: Shutter) -> RowClock:
-    """The rows' times of a camera called `name`. Raises UserError for one that is read column by column."""
+    Raises UserError for a camera, called `name`, that is read column by column.
+    """
     if shutter.readout_s == 0.0:
-        return RowClock(-0.5 * shutter.exposure_s, 0.0)
+        return -0.5 * shutter.exposure_s, 0.0
     if not shutter.by_rows:
         raise UserError(
             f"{name}: scan {shutter.scan} reads columns, but a line_delay belongs to rows: render with top-bottom"
         )
     rows = [[0.0, 0.0], [0.0, 1.0]]
     first, second = shutter.line_mid_time(0.0, shutter.line_of_pixel(rows, camera), camera)
-    return RowClock(float(first), float(second - first))
+    return float(first), float(second - first)
 
 
 def _matrix(T: FloatArray) -> list[list[float]]:

@@ -8,7 +8,6 @@ inside it meet its surfaces from behind.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +29,6 @@ _MOST_CELLS = 4  # along a side
 _LAMP = 0.12  # half a lamp's side, of its cell's shorter one
 _MOST_LAMP_M = 0.3
 _GAP = 0.02  # below the ceiling, of a lamp's height over the middle
-
-
-@dataclass(frozen=True)
-class Lamps:
-    """Square lamps: corners (n, 4, 3), facing down, and their radiance."""
-
-    corners: FloatArray
-    radiance: float
 
 
 class Probe:
@@ -65,8 +56,11 @@ class Probe:
         met, from_front = (v.reshape(len(origins), -1).mean(axis=1) for v in (np.isfinite(distance), front))
         return bool(((met >= _ENCLOSED) & (from_front > met / 2)).mean() > 0.5)
 
-    def lamps(self) -> Lamps | None:
-        """Lamps under the ceilings above the middle of the room's height; None if there is no ceiling."""
+    def lamps(self) -> tuple[FloatArray, float] | None:
+        """Square lamps under the ceilings above the middle of the room's height; None if there is no ceiling.
+
+        Corners (n, 4, 3), facing down, and the lamps' radiance.
+        """
         size, ground = self.high - self.low, [0, 2]
         count = np.clip((size[ground] / _CELL_M).astype(int), 1, _MOST_CELLS)
         cells = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 2)
@@ -84,7 +78,7 @@ class Probe:
         corners[..., 1] += (1 - _GAP) * above[inside].min(axis=1, keepdims=True)
         area = len(corners) * (2 * half) ** 2
         floor = size[ground].prod() * inside.mean()
-        return Lamps(corners, float(_IRRADIANCE * floor / (np.pi * area)))
+        return corners, float(_IRRADIANCE * floor / (np.pi * area))
 
     def _cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Distance (n,) to what rays (n, 3) meet, inf for nothing, and whether they meet it from in front."""
@@ -109,10 +103,10 @@ def light_shapes(mi: Any, path: Path, parts: Sequence[Part], light: SceneLight, 
     if lamps is None:
         return {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY}}}
     shapes: dict[str, Any] = {}
-    for number, corners in enumerate(lamps.corners):
+    for number, corners in enumerate(lamps[0]):
         file = folder / f"lamp{number}.ply"
         file.write_bytes(ply_bytes(corners, np.array([[0, 1, 2], [0, 2, 3]])))
-        radiance = {"type": "rgb", "value": lamps.radiance}
+        radiance = {"type": "rgb", "value": lamps[1]}
         shapes[f"lamp{number:05}"] = {
             "type": "ply", "filename": str(file), "face_normals": True, "bsdf": {"type": "diffuse"},
             "emitter": {"type": "area", "radiance": radiance},

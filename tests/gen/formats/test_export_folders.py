@@ -77,11 +77,11 @@ def test_kalibrs_chain_of_transforms_closes(sequence: Sequence, tmp_path: Path) 
 @pytest.mark.parametrize("scan", ["top-bottom", "bottom-top"])
 def test_kalibrs_two_numbers_give_every_rows_time(scan: Scan) -> None:
     camera, shutter = Camera(64, 48, 50, 50, 31.5, 23.5), Shutter(0.028, 0.01, scan)
-    clock = row_clock("color", camera, shutter)
+    first_s, delay_s = row_clock("color", camera, shutter)
     for v in (0, 1, 20, 47):
         start, end = line_window(shutter, 3.0, shutter.line_of_pixel([5, v], camera), camera)
-        assert 3.0 + clock.first_s + v * clock.delay_s == pytest.approx((start + end) / 2, abs=1e-15)
-    assert (clock.delay_s < 0) == (scan == "bottom-top")
+        assert 3.0 + first_s + v * delay_s == pytest.approx((start + end) / 2, abs=1e-15)
+    assert (delay_s < 0) == (scan == "bottom-top")
 
 
 def test_kalibr_without_an_imu(plain: Sequence, tmp_path: Path) -> None:
