@@ -20,7 +20,9 @@ from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import write_error
 from rsgen.formats import IMPORTS, scene_importer
-from rsgen.formats.meshes.mesh_file import finished, light_shapes, part_shapes, read_parts
+from rsgen.formats.meshes.default_light import light_shapes
+from rsgen.formats.meshes.mesh_file import part_shapes, read_parts
+from rsgen.formats.meshes.parts import finished
 from rsgen.formats.scenes.content import Content, lamp_shapes
 from rsgen.image_codecs import encode_exr, encode_png
 from rsgen.inputs import check_input

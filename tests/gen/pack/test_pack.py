@@ -12,12 +12,13 @@ import pytest
 from tiny import write_config
 
 from rsgen.cli.main import main
-from rsgen.config.config import load_config
+from rsgen.config.config import Config, load_config
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.pack.draw import Drawn, PackOptions, camera_spline, draw_sequence
-from rsgen.pack.pairs import flo_bytes, mark_file, pdepth_text
+from rsgen.pack.pairs import T_depth_color, flo_bytes, mark_file, pdepth_text
+from rsgen.produce.parts import load_motion
 
 SPAN = [(2.0, 12.0), (0.0, 1.0)]
 
@@ -117,6 +118,14 @@ def packed(small_config: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     out = tmp_path_factory.mktemp("packs") / "pack"
     assert main(["pack", str(small_config), "--count", "3", "--out", str(out), "--quiet", *OPTIONS]) == 0
     return out
+
+
+def drawn_in(folder: Path, config: Config) -> tuple[Drawn, Spline]:
+    """What was drawn for a sequence, and its camera's curve."""
+    about = json.loads((folder / "sequence.json").read_text())
+    names = ("readout_s", "exposure_s", "start_s", "speed", "seed")
+    drawn = Drawn(config=0, turn=tuple(about["turn"]), **{name: about[name] for name in names})
+    return drawn, camera_spline(load_motion(config).spline, drawn, T_depth_color(config))
 
 
 def read_flow(path: Path) -> np.ndarray:
