@@ -38,7 +38,7 @@ _NONE = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class ColumnSums:
-    """Sums with c, the derivatives of r by n further unknowns: a colour image's gain and offset, what lenses are like.
+    """Sums with c, the derivatives of r by n further unknowns, such as a colour image's gain and offset.
 
     coupling (nc, nr, 6, n) = Σ w j cᵀ, H (n, n) = Σ w c cᵀ and g (n,) = Σ w c s over all blocks.
     """
@@ -210,8 +210,8 @@ def contribution(
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """Every stride-th pixel of every stride-th row of an image, or some of them: their number among those, their index
-    in the whole image, x and y, and which are meant (the others lie beyond the end of a run)."""
+    """Some of every stride-th pixel and row of an image: number among these, index in the image, x and y; which are
+    meant (others lie beyond the end of a run)."""
 
     number: Any
     index: Any

@@ -51,13 +51,11 @@ _WIDEST = 4.0
 
 @dataclass(frozen=True)
 class GeometricInput:
-    """Device arrays that the geometric kernel takes.
+    """Device arrays of the geometric kernel.
 
-    depth: z (m) of the current image, every pixel; rays_*: its normalised coordinates; to_base: its lines' poses.
-    inverse_depth, roughness (m): the reference's; slope_*: gradient of its inverse depth by normalised coordinates,
-    smoothed: it gives normals, while the residual takes inverse depth as it is; from_base: its lines' poses if it is
-    not rectified. constants: those of `Scaling`; the roughness beyond which a pixel of the reference
-    is no smooth one; and 0 to leave those out, 1 to weigh them by the fourth power of how much too rough they are.
+    depth (m), rays_* (normalised), to_base: of the current image's pixels and lines. inverse_depth, slope_* (smoothed,
+    for normals), roughness (m), from_base: of the reference. constants: those of `Scaling`; the roughness beyond which
+    a pixel of the reference is not smooth; and 0 to leave such out, 1 to weigh them by its inverse fourth power.
     """
 
     depth: Any
@@ -77,9 +75,8 @@ def geometric_kernel(
 ) -> Callable[[GeometricInput], Any]:
     """Kernel of the geometric term, equations (6) and (15): sums over blocks, as `Scaling.unpack` takes them.
 
-    lens: the current depth camera. ref_lens: the reference's camera; global shutter if it is rectified (then the base
-    frame is the reference's own). shifts: with columns by what all of the image's inverse depth may be off by, see
-    `whole_image`.
+    lens, ref_lens: the current depth camera's and the reference's, whose frame is the base if it is rectified. shifts:
+    with the columns of `whole_image`.
     """
     camera, ref, count = lens.camera, ref_lens.camera, WHOLE if shifts else 0
 
@@ -164,12 +161,11 @@ def evened(z: Any, inv_median_depth: Any) -> Any:
 
 @dataclass(frozen=True)
 class PhotometricInput:
-    """Device arrays that the photometric kernel takes.
+    """Device arrays of the photometric kernel.
 
-    x, y, z: points of the reference's every stride-th pixel in its camera's frame (m), z = 0 where there is none;
-    intensity: theirs; visible: 0 for points that are hidden; to_base: its lines' poses if it is not rectified.
-    image: intensities of the pyramid's level, NaN where clipped; from_base: the colour camera's lines.
-    constants: those of `Scaling`, and the image's gain and offset, see `alignment.brightness`.
+    x, y, z (m; 0: none), intensity, visible (0 or 1): points of the reference's every stride-th pixel in its camera's
+    frame; to_base: its lines' poses. image: intensities of the pyramid's level, NaN where clipped; from_base: its
+    lines. constants: those of `Scaling`, and the image's gain and offset.
     """
 
     x: Any

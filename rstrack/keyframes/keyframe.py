@@ -52,15 +52,13 @@ class Points:
 class Reference:
     """A keyframe.
 
-    T_world_base (4, 4) at time `t` (s): the frame in which its depth is given if it is rectified. `rolling`: the
-    depth camera's exposure if it is not; the base frame is then only a frame to compute in.
-    Inverse depth (1/m, 0 missing), its smoothed slopes by normalised coordinates, how far bilinear interpolation of it
-    may be off (m), and fusion weights, on the device.
-    median_depth, bound: see `block_sums.Scaling`, for the geometric term. pixels: of the finest level that have depth.
-    moments: of its colour image; brightness: gain and offset (2,) of that against the track's first colour image.
-    intensity (h, w): the same on the host, NaN where unknown. *_thumbnail: see `pyramid.thumbnail`.
-    coarse_intensity (h, w): what the coarser levels are made from where colour is finer than depth, low-passed to the
-    depth camera's pixels; None where `intensity` is that.
+    T_world_base (4, 4) at time `t` (s): its depth's frame if it is rectified. rolling: the depth camera's exposure if
+    it is not; the base frame is then only a frame to compute in. On the device: inverse_depth (1/m, 0 missing), its
+    smoothed slopes by normalised coordinates, roughness (error of its bilinear interpolation, m), fusion weight.
+    median_depth, bound: see `block_sums.Scaling`. pixels: of the finest level that have depth. moments: of its colour
+    image; brightness: gain and offset (2,) of that against the track's first one. intensity (h, w): on the host, NaN
+    unknown. coarse_intensity (h, w): for coarser levels where colour is finer than depth, low-passed to the depth
+    camera's pixels, else None. *_thumbnail: see `pyramid.thumbnail`.
     """
 
     index: int

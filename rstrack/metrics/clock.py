@@ -73,7 +73,7 @@ def shifted(truth: Truth, offset_s: float) -> Truth:
     return dataclasses.replace(truth, motion=motion, interpolate=True)
 
 
-def fit_clock(truth: Truth, estimate: Estimate, seed: int = 0) -> ClockFit:
+def fit_clock(truth: Truth, estimate: Estimate) -> ClockFit:
     """Find the offset within ±0.1 s at which the drift per second is least.
 
     Minimised is the mean absolute error of relative poses over one second (`evaluate`'s RPE, but not squared, so that a
@@ -98,19 +98,19 @@ def fit_clock(truth: Truth, estimate: Estimate, seed: int = 0) -> ClockFit:
             f"estimate: its errors have no minimum within {1e3 * SEARCH_S:g} ms of clock offset: give the offset in "
             "seconds, or repair the track first"
         )
-    sigma = {name: errors.deviation(c, least[name], seed) for c, name in enumerate(CRITERIA) if name in least}
+    sigma = {name: errors.deviation(c, least[name]) for c, name in enumerate(CRITERIA) if name in least}
     best = min((name for name in CRITERIA if name in least), key=lambda name: sigma[name])
     trajectory = [errors.trajectory(tau) for tau in coarse]
     k = int(np.clip(np.argmin(trajectory), 1, len(coarse) - 2))
     return ClockFit(least[best], sigma[best], best, {**least, "trajectory": _brent(errors.trajectory, coarse, k)})
 
 
-def resampled_blocks(stamps: FloatArray, seed: int) -> list[IntArray]:
+def resampled_blocks(stamps: FloatArray) -> list[IntArray]:
     """Indices of 200 resamples of what happens at times (n,), s, of a recording: blocks of 2 s, with replacement."""
     count = len(stamps)
     per_second = count / (stamps[-1] - stamps[0])
     length = int(np.clip(_BLOCK_S * per_second, 1, count // 4))
-    starts = np.random.default_rng(seed).integers(0, count, (_RESAMPLES, -(-count // length)))
+    starts = np.random.default_rng(0).integers(0, count, (_RESAMPLES, -(-count // length)))
     # Circular: both ends count as often as the middle.
     return [((blocks[:, None] + np.arange(length)) % count).ravel() for blocks in starts]
 
@@ -171,11 +171,11 @@ class _Errors:
         aligned = se3.transform(T_true_est, self.T_est[:, :3, 3])
         return float(np.linalg.norm(aligned - T_true[:, :3, 3], axis=1).mean())
 
-    def deviation(self, criterion: int, tau: float, seed: int) -> float:
+    def deviation(self, criterion: int, tau: float) -> float:
         """Standard deviation of the least point of a drift curve that is least at tau, seconds."""
         offsets = tau + _steps(_FINE_REACH_S, _FINE_S)
         curves = np.stack([self.drift(float(at))[criterion] for at in np.clip(offsets, -SEARCH_S, SEARCH_S)], axis=1)
-        drawn = resampled_blocks(self.stamps[self.i], seed)
+        drawn = resampled_blocks(self.stamps[self.i])
         minima = [offsets[int(np.argmin(curves[k].mean(axis=0)))] for k in drawn]
         low, high = np.quantile(minima, [0.16, 0.84])
         # Minima are found on a grid: no finer than its rounding error.

@@ -47,13 +47,12 @@ _SHUTTERS = {"rs": "the rolling-shutter model", "gs": "taking the shutter for a 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Errors of one estimate; None where they cannot be had (`notes` has the reason).
+    """Errors of one estimate; None where there are none (`notes` has the reason).
 
-    frames, frames_tracked: of the sequence, and those among them with a pose within 0.02 s. poses, poses_compared: of
-    the estimate, and those with a true counterpart. ate_*: absolute trajectory error. rpe_*: relative pose error over
-    one second, `rpe_pairs` of them. row_*: over the depth images' lines, `rows` of them in `rows_total`. consistency:
-    errors beside the run's covariances, of the horizons over which both are known; truth_noise: what is counted there
-    of the truth's own errors.
+    frames, frames_tracked: of the sequence, and those with a pose within 0.02 s. poses, poses_compared: of the
+    estimate, and those with a true counterpart. ate_*: absolute trajectory error. rpe_*: relative pose error over one
+    second. row_*: over the depth images' lines. consistency: errors beside the run's covariances, by horizon;
+    truth_noise: the truth's own errors that are counted there.
     """
 
     frames: int
@@ -148,19 +147,13 @@ class RelativeErrors:
 def evaluate(truth: Truth, estimate: Estimate) -> Metrics:
     """Compare an estimate with the truth.
 
-    Association: a spline is evaluated exactly at the estimate's stamps; stamps outside its time are left out and
-    counted. True poses are associated with the nearest stamp, one to one and within 0.02 s, as TUM's associate.py does,
-    or, with `Truth.interpolate`, interpolated on SE(3) where one of them is that near.
-
-    ATE (`association.align`): distances between positions after the rigid alignment, as in TUM's evaluate_ate.py.
-
-    RPE: E = (T_true,i⁻¹ T_true,j)⁻¹ (T_est,i⁻¹ T_est,j), RMSE of its translation and angle over the pairs (i, j) of
-    `pairs_one_second_apart`; the estimate's association decides which true poses are meant. TUM's evaluate_rpe.py
-    multiplies in the other order, seeing each step from its end: the rotation is the same, the translation that of this
-    definition with time reversed.
-
-    Errors by line: positions and rotations at all depth lines' mid-exposures where both splines are known, after the
-    alignment of the frames' poses.
+    Association: a spline is evaluated at the estimate's stamps; stamps outside its time are left out and counted. True
+    poses are associated with the nearest stamp, one to one and within 0.02 s, as by TUM's associate.py, or, with
+    `Truth.interpolate`, interpolated on SE(3). ATE: distances between positions after `association.align`, as in TUM's
+    evaluate_ate.py. RPE: E = (T_true,i⁻¹ T_true,j)⁻¹ (T_est,i⁻¹ T_est,j), RMSE of its translation and angle over
+    `pairs_one_second_apart`. TUM's evaluate_rpe.py multiplies in the other order: the rotation is the same, the
+    translation that of this definition with time reversed. Errors by line: at all depth lines' mid-exposures where both
+    splines are known, after the alignment of the frames' poses.
 
     Raises UserError if fewer than three poses have a true counterpart, or the run's covariances are malformed.
     """

@@ -81,7 +81,7 @@ def mounted(truth: Truth, T_body_camera: FloatArray) -> Truth:
     return dataclasses.replace(truth, motion=motion)
 
 
-def fit_extrinsics(truth: Truth, estimate: Estimate, seed: int = 0) -> ExtrinsicsFit:
+def fit_extrinsics(truth: Truth, estimate: Estimate) -> ExtrinsicsFit:
     """Find the transform on the right of the truth's poses with which the motions over one second agree best.
 
     Least squares over the pairs of `evaluate`'s RPE, translations and rotations each in units of their own remaining
@@ -115,7 +115,7 @@ def fit_extrinsics(truth: Truth, estimate: Estimate, seed: int = 0) -> Extrinsic
         x = solution.x
     J = np.asarray(solution.jac, np.float64).reshape(-1, 6, 6)
     H, g = np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, residuals(x).reshape(-1, 6))
-    errors = np.stack([-np.linalg.solve(H[k].sum(0), g[k].sum(0)) for k in resampled_blocks(stamps[i], seed)])
+    errors = np.stack([-np.linalg.solve(H[k].sum(0), g[k].sum(0)) for k in resampled_blocks(stamps[i])])
     sigma = errors.std(axis=0)
     return ExtrinsicsFit(_rigid(so3.exp(x[3:]) @ R, p + x[:3]), sigma[:3], np.degrees(sigma[3:]))
 

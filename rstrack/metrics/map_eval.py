@@ -156,16 +156,14 @@ def seen_surface(sequence: Sequence) -> FloatArray:
     return points
 
 
-def evaluate_map(
-    mesh: FloatArray, scene: FloatArray, seen: FloatArray | None, samples: int = 50_000, seed: int = 0
-) -> MapErrors:
+def evaluate_map(mesh: FloatArray, scene: FloatArray, seen: FloatArray | None, samples: int = 50_000) -> MapErrors:
     """Compare triangles (m, 3, 3) of a mesh with the scene's (k, 3, 3), in one world frame; seen: (n, 3) points.
 
-    `samples` points of each side at most, drawn with `seed`. Raises UserError if a side is empty.
+    `samples` points of each side at most. Raises UserError if a side is empty.
     """
     if not len(mesh) or not len(scene):
         raise UserError("map-eval: a surface without triangles cannot be compared: give meshes, not point clouds")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     accuracy = Triangles(scene).distance(sample_surface(mesh, samples, rng))
     if seen is None or not len(seen):
         return MapErrors(Spread.of(accuracy), None, None)
@@ -174,12 +172,12 @@ def evaluate_map(
     return MapErrors(Spread.of(accuracy), Spread.of(missing), float((missing <= 0.02).mean()))
 
 
-def run_map_eval(mesh_path: Path, scene_path: Path, samples: int = 50_000, seed: int = 0) -> MapErrors:
+def run_map_eval(mesh_path: Path, scene_path: Path, samples: int = 50_000) -> MapErrors:
     """Compare a mesh that `rstrack map` wrote with SEQ/scene.ply. Raises UserError, naming the file at fault."""
     mesh, scene = read_triangles(mesh_path), read_triangles(scene_path)
     folder = Path(scene_path).parent
     seen = seen_surface(read_sequence(folder)) if (folder / "sequence.yaml").exists() else None
-    return evaluate_map(mesh, scene, seen, samples, seed)
+    return evaluate_map(mesh, scene, seen, samples)
 
 
 def read_triangles(path: Path) -> FloatArray:

@@ -19,6 +19,8 @@ from rstrack.volume.volume import Blocks
 
 # Blocks along a chunk's edge.
 _CHUNK = 8
+# Weight from which on a lattice point has been seen.
+_LEAST_WEIGHT = 1e-3
 # Vertices of neighbouring chunks that are so near (voxels) are one.
 _WELD = 1e-3
 _NOTHING = np.zeros(0, np.int64)
@@ -35,15 +37,15 @@ class TriangleSurface:
     colors: npt.NDArray[np.uint8] | None
 
 
-def extract_surface(blocks: Blocks, voxel_m: float, least_weight: float = 1e-3) -> TriangleSurface:
-    """Triangles where the distance is zero, between lattice points of at least this weight.
+def extract_surface(blocks: Blocks, voxel_m: float) -> TriangleSurface:
+    """Triangles where the distance is zero, between lattice points that have been seen.
 
     Marching cubes after Lewiner et al. (Journal of Graphics Tools 8(2), 2003), scikit-image's. Raises UserError if
     there is no surface.
     """
     vertices, faces, colors, count = [], [], [], 0
     for origin, tsdf, weight, color in _chunks(blocks):
-        found = _march(tsdf, weight >= least_weight)
+        found = _march(tsdf, weight >= _LEAST_WEIGHT)
         if found is None:
             continue
         zyx, triangles = found

@@ -33,9 +33,8 @@ from rstrack.volume.kernels import (
     visible_blocks_kernel,
 )
 
-TRUNCATION = 4.0
-"""Voxels to both sides of a surface within which distances are stored."""
-
+# Voxels to both sides of a surface within which distances are stored: at most the eight of a block.
+_TRUNCATION = 4.0
 _NEAR_M = 0.05
 # Of the distance that a ray is followed, where the window cannot hold all that it might cross.
 _SHORTER = 0.8
@@ -65,15 +64,10 @@ class Volume:
     until they are needed: what the volume holds does not depend on that, to the last bit.
     """
 
-    def __init__(
-        self, e: Engine, voxel_m: float = 0.01, color: bool = False, truncation: float = TRUNCATION,
-        most_bytes: float = float("inf"),
-    ) -> None:  # fmt: skip
+    def __init__(self, e: Engine, voxel_m: float = 0.01, color: bool = False, most_bytes: float = float("inf")) -> None:
         if not 1e-4 <= voxel_m <= 1.0:
             raise UserError(f"voxel size {voxel_m!r} m must be between 0.0001 and 1 m")
-        if not 2.0 <= truncation <= 8.0:
-            raise UserError(f"truncation {truncation!r} must be between 2 and 8 voxels: blocks are 8 voxels wide")
-        self.e, self.voxel_m, self.truncation_m = e, float(voxel_m), truncation * float(voxel_m)
+        self.e, self.voxel_m, self.truncation_m = e, float(voxel_m), _TRUNCATION * float(voxel_m)
         self._colored = color
         self._directory, self._table = BlockDirectory(), e.Int()
         self._values = BlockValues(e, 6 if color else 2, most_bytes)
