@@ -16,6 +16,18 @@ from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
 
+# Instants at most.
+_MOST = 300
+# Windows at most: an evaluation takes as long as a step of the solution.
+_FEW = 3
+# Fixed-point steps that are taken: what is missing then, a tenth or so, is extrapolated, to some percent.
+_ROUNDS = 3
+# Part of the last step that may be added to it at most.
+_MOST_MORE = 2.0
+# Points looked at, and those in a picture: every so many px of a 640 px wide image, in both directions.
+_EVERY, _PICTURED = 20, 40
+_STEP = 1e-5
+
 
 @dataclass(frozen=True)
 class MeanMotion:
@@ -39,10 +51,6 @@ def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> MeanMo
     v, a = track.velocity(stamps), track.acceleration(stamps)
     means = [float(np.linalg.norm(x, axis=1).mean()) for x in (v[:, :3], v[:, 3:], a[:, 3:])]
     return MeanMotion(*means)
-
-
-# Instants at most.
-_MOST = 300
 
 
 @dataclass(frozen=True)
@@ -71,14 +79,6 @@ def pace_of(dataset: Dataset, followed: Sequence[range], track: Spline) -> Pace:
 def since_begin(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> FloatArray:
     """Stamps (n,) of frames, s since the recording's first."""
     return np.asarray(dataset.stamps[np.asarray(frames)] - dataset.stamps[0])
-
-
-# Windows at most: an evaluation takes as long as a step of the solution.
-_FEW = 3
-# Fixed-point steps that are taken: what is missing then, a tenth or so, is extrapolated, to some percent.
-_ROUNDS = 3
-# Part of the last step that may be added to it at most.
-_MOST_MORE = 2.0
 
 
 @dataclass(frozen=True)
@@ -129,11 +129,6 @@ def _scales(window: RecordingWindow, terms: PairTerms, p: Parameters) -> FloatAr
         window.sums(terms, p, 0)
         scales.append(window.sigma)
     return np.array(scales)
-
-
-# Points looked at, and those in a picture: every so many px of a 640 px wide image, in both directions.
-_EVERY, _PICTURED = 20, 40
-_STEP = 1e-5
 
 
 def displacement_px(before: Camera, after: Camera, every: int = _EVERY) -> FloatArray:

@@ -88,6 +88,10 @@ NEEDS = (
     *(("surfaces near and far, seen from near and far",) * 3),
 )  # fmt: skip
 """What a recording needs to determine it."""
+# How far, in σ, the estimate of a recording may lie from what was known before it is taken to contradict it.
+_CONTRADICTS = 3.0
+# The part of what was known by which a solution has to move at least, over that many σ, to count as moved.
+_LEAST = 0.1
 
 
 @dataclass(frozen=True)
@@ -165,12 +169,6 @@ def changed(camera: Camera, lens: FloatArray) -> Camera:
 def free_of(groups: Sequence[str]) -> BoolArray:
     """Which of the unknowns (31,) belong to the groups."""
     return np.array([group in groups for group in _GROUP_OF])
-
-
-# How far, in σ, the estimate of a recording may lie from what was known before it is taken to contradict it.
-_CONTRADICTS = 3.0
-# The part of what was known by which a solution has to move at least, over that many σ, to count as moved.
-_LEAST = 0.1
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,12 @@ _METHODS: tuple[Method, ...] = ("rs-g", "baseline", "rs-pg")
 _LONG_ENOUGH = 0.9
 # Periods between frames from which on they are not in a row.
 _GAP = 2.5
+# Seconds before the first and after the last line for which a window has spline: times move while they are estimated.
+_MARGIN_S = 0.08
+# What the colour camera may be further away than the file states, m.
+_BASELINE_M = 0.01
+# Rounds of correction of a spline that is to pass through poses.
+_ROUNDS = 6
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,7 @@ def first_track(dataset: Dataset, chosen: range, options: Options, progress: Pro
     """Of the frames of a dataset. Raises UserError: nothing can be followed."""
     whole, best = dataset.stamps[chosen[-1]] - dataset.stamps[chosen[0]], None
     for method in _METHODS:
-        found = _tracked(dataset, chosen, replace(options, method=method), progress)
+        found = tracked(dataset, chosen, replace(options, method=method), progress)
         if found is not None and (best is None or found.seconds > best.seconds):
             best = found
         if best is not None and best.seconds > _LONG_ENOUGH * whole:
@@ -75,7 +81,8 @@ def first_track(dataset: Dataset, chosen: range, options: Options, progress: Pro
     return best
 
 
-def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> TrackedSpline | None:
+def tracked(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> TrackedSpline | None:
+    """Frames followed roughly by the options' method; None if they cannot be."""
     tracker = rough_track(dataset, chosen, options, lambda done: progress(f"first track ({options.method})", done, ""))
     if tracker.spline is not None and tracker.spline_valid:
         return TrackedSpline(tracker.spline, tuple(tracker.spline_valid))
@@ -90,14 +97,6 @@ def _tracked(dataset: Dataset, chosen: range, options: Options, progress: Progre
     breaks = np.flatnonzero(np.diff(stamps) > _GAP * period) + 1
     spans = tuple((float(part[0]), float(part[-1])) for part in np.split(stamps, breaks))
     return TrackedSpline(through(se3.interpolated(stamps, poses, knots), t0, dt), spans)
-
-
-# Seconds before the first and after the last line for which a window has spline: times move while they are estimated.
-_MARGIN_S = 0.08
-# What the colour camera may be further away than the file states, m.
-_BASELINE_M = 0.01
-# Rounds of correction of a spline that is to pass through poses.
-_ROUNDS = 6
 
 
 def load_window(

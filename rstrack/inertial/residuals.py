@@ -20,6 +20,9 @@ from rstrack.inertial.factor import ImuFactor, motion
 
 # Readings within this part of the range's end are saturated, or may be.
 _SATURATED = 0.995
+# An outlier stands out from between its neighbours by so many σ of the noise, and so many times as far as the four
+# around it differ: motion that sudden would show in these, too. A bus that drops a bit leaves such readings.
+_SIGMAS, _TIMES = 20.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -156,11 +159,6 @@ class ImuResiduals:
                 total[to, tail] += squares[own, 24:]
                 total[to, low : low + 24] += squares[own, :24]
         return ImuQuadratic(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), scatter
-
-
-# An outlier stands out from between its neighbours by so many σ of the noise, and so many times as far as the four
-# around it differ: motion that sudden would show in these, too. A bus that drops a bit leaves such readings.
-_SIGMAS, _TIMES = 20.0, 3.0
 
 
 def outliers(values: FloatArray, sigma: float) -> BoolArray:

@@ -20,6 +20,8 @@ from rstrack.inertial.residuals import ImuQuadratic, without_tail
 
 # Information of a control point that nothing observes (σ 100 m, rad): systems are never singular.
 _NOTHING = 1e-4
+# Increments of control points (m, rad) that leave the samples' derivatives as they were.
+_SAME = 1e-2
 
 
 @dataclass
@@ -147,10 +149,6 @@ class Smoother:
         only = Smoother(self.first, self.H, self.g, self.at, self.estimate)
         only.forget(self.last)
         return ImuEstimate(self.estimate - np.linalg.solve(only.H, only.g), only.H)
-
-
-# Increments of control points (m, rad) that leave the samples' derivatives as they were.
-_SAME = 1e-2
 
 
 class ReusedPrior:

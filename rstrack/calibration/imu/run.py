@@ -19,11 +19,10 @@ from rsgen.geometry.spline import Spline
 from rstrack.calibration.imu.model import CorrectedTrack, ImuUnknowns
 from rstrack.calibration.imu.result import ImuCalibration
 from rstrack.calibration.imu.solve import ImuData, solve
-from rstrack.calibration.start import TrackedSpline
+from rstrack.calibration.start import TrackedSpline, tracked
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
-from rstrack.tracking.first_look.rough_track import rough_track
 
 # Seconds that must have been followed; at both ends nothing is taken, since the clock moves.
 _LEAST_S, _MARGIN_S = 5.0, 0.06
@@ -51,12 +50,10 @@ def track_of_run(folder: Path) -> TrackedSpline:
 
 def track_of(dataset: Dataset, frames: slice, options: Options, progress: Progress) -> TrackedSpline:
     """By tracking a dataset's frames with depth and colour. Raises UserError: nothing was followed."""
-    chosen = range(len(dataset))[frames]
-    how = replace(options, method="rs-pg")
-    tracker = rough_track(dataset, chosen, how, lambda done: progress("tracking", done, ""))
-    if tracker.spline is None or not tracker.spline_valid:
+    found = tracked(dataset, range(len(dataset))[frames], replace(options, method="rs-pg"), progress)
+    if found is None:
         raise UserError(f"{dataset.root}: these frames give no track: choose --frames with more to see")
-    return TrackedSpline(tracker.spline, tuple(tracker.spline_valid))
+    return found
 
 
 def calibrate_imu(dataset: Dataset, followed: TrackedSpline, progress: Progress = no_progress) -> ImuCalibration:

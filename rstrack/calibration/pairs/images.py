@@ -26,6 +26,12 @@ from rstrack.images.line_poses import rows_of
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import depth_scaling, surface_bends, surface_slopes
 
+# Part of the width over which inverse depth is averaged, to either side.
+_WINDOW = 1.0 / 160.0
+# Inverse depth larger by this part may hide a point from the colour camera.
+_HIDES = 0.2
+Float32Image = npt.NDArray[np.float32]
+
 
 def pair_lens(camera: Camera, shutter: Shutter) -> Lens:
     """The lens that kernels are compiled for: with any readout, since that is an unknown."""
@@ -128,14 +134,6 @@ def span(images: Sequence[ImageTiming], p: Parameters) -> tuple[float, float]:
     """Times (s) within which the lines of all images lie."""
     spans = [image.span(p) for image in images]
     return min(begin for begin, _ in spans), max(end for _, end in spans)
-
-
-# Part of the width over which inverse depth is averaged, to either side.
-_WINDOW = 1.0 / 160.0
-# Inverse depth larger by this part may hide a point from the colour camera.
-_HIDES = 0.2
-
-Float32Image = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
