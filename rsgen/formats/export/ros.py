@@ -16,6 +16,7 @@ from __future__ import annotations
 import heapq
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,6 @@ def export_ros(sequence: Sequence, out: Path, options: ExportOptions, progress: 
     """Write the bag `out`, whole or not at all; returns one line.
 
     options.name: ros1 for a .bag, ros2 for a folder, mcap for a file; options.storage: sqlite3 or mcap, of ros2.
-
     Cameras are those that the sequence declares, poses are true. ROS has no times before 0: what the IMU and the truth
     have before is left out of their topics, not out of the spline. Raises UserError if rosbags is not installed, `out`
     is there or named otherwise, a stamp is negative, or a file cannot be read or written.
@@ -120,7 +120,7 @@ def _poses(bag: Bag, truth: FloatArray) -> Iterator[Message]:
         posed(ns, header=bag.header(ns, WORLD_FRAME), pose=pose)
 
     for ns, row in zip(nanoseconds(truth[:, 0]), truth[:, 1:], strict=True):
-        yield ns, lambda ns=ns, row=row: write(ns, row)  # type: ignore[misc]
+        yield ns, partial(write, ns, row)
 
 
 def _transform(bag: Bag, ns: int, parent: str, child: str, pose: FloatArray) -> Any:
@@ -150,7 +150,7 @@ def _images(bag: Bag, sequence: Sequence, stream: ImageStream) -> Iterator[Messa
         bag.images += 1
 
     for k, ns in enumerate(nanoseconds(stream.listed)):
-        yield ns, lambda ns=ns, k=k: write(ns, k)  # type: ignore[misc]
+        yield ns, partial(write, ns, k)
 
 
 def _depth(sequence: Sequence, k: int) -> tuple[np.ndarray, str]:
@@ -164,7 +164,7 @@ def _depth(sequence: Sequence, k: int) -> tuple[np.ndarray, str]:
 def _imu(bag: Bag, imu: SequenceImu) -> Iterator[Message]:
     """Readings from time 0 on, with covariances of the white noise and no orientation."""
     config, samples = imu.config, imu.samples
-    write = bag.add(IMU_TOPIC, "sensor_msgs/msg/Imu")
+    add = bag.add(IMU_TOPIC, "sensor_msgs/msg/Imu")
     gyro, accel = (
         (np.eye(3) * density**2 * config.rate_hz).ravel()
         for density in (config.gyroscope_noise_density, config.accelerometer_noise_density)
@@ -172,17 +172,18 @@ def _imu(bag: Bag, imu: SequenceImu) -> Iterator[Message]:
     absent = np.zeros(9)
     absent[0] = -1.0
 
-    def fields(ns: int, k: int) -> dict[str, Any]:
-        return {
-            "header": bag.header(ns, IMU_FRAME),
-            "orientation": bag.vector("Quaternion", np.array([0.0, 0.0, 0.0, 1.0])),
-            "orientation_covariance": absent,
-            "angular_velocity": bag.vector("Vector3", samples.gyro[k]),
-            "angular_velocity_covariance": gyro,
-            "linear_acceleration": bag.vector("Vector3", samples.accel[k]),
-            "linear_acceleration_covariance": accel,
-        }
+    def write(ns: int, k: int) -> None:
+        add(
+            ns,
+            header=bag.header(ns, IMU_FRAME),
+            orientation=bag.vector("Quaternion", np.array([0.0, 0.0, 0.0, 1.0])),
+            orientation_covariance=absent,
+            angular_velocity=bag.vector("Vector3", samples.gyro[k]),
+            angular_velocity_covariance=gyro,
+            linear_acceleration=bag.vector("Vector3", samples.accel[k]),
+            linear_acceleration_covariance=accel,
+        )
 
     for k, ns in enumerate(nanoseconds(samples.stamps)):
         if ns >= 0:
-            yield ns, lambda ns=ns, k=k: write(ns, **fields(ns, k))  # type: ignore[misc]
+            yield ns, partial(write, ns, k)
