@@ -29,9 +29,7 @@ from rsgen.produce.records import (
     write_listings,
 )
 from rsgen.sensors.color import Setting
-from rsgen.sensors.imu import (
-    sample_clock,
-)
+from rsgen.sensors.imu import sample_clock
 from rsgen.sensors.reports import color_clock
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (

@@ -177,10 +177,7 @@ def test_a_run_that_declares_something_else_is_another_sequence(pair: tuple[Path
 @pytest.mark.parametrize(
     ("declared", "complaint"),
     [
-        (
-            {"color": {"scan": "left-right"}},
-            "faults.declared.color.scan: left-right is across the true one",
-        ),
+        ({"color": {"scan": "left-right"}}, "faults.declared.color.scan: left-right is across the true one"),
         ({"depth": {"model": "radtan"}}, "faults.declared.depth.* radtan takes 4 or 5 finite distortion coefficients"),
         ({"color": {"intrinsics": [-5, 5, 1, 1]}}, "faults.declared.color.* fx"),
         ({"depth": {"depth_scale": 0}}, "faults.declared.depth.*depth_scale: must lie in"),

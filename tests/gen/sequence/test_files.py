@@ -140,19 +140,14 @@ def test_the_same_data_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> 
     arrays = {"control_points": np.tile(np.eye(4), (5, 1, 1)), "t0": np.array(0.5), "dt": np.array(0.05)}
     first = codecs.encode_npz(arrays), codecs.encode_exr(Z), codecs.encode_png(RGB)
     monkeypatch.setattr("time.time", lambda: 2e9)
-    assert (
-        codecs.encode_npz(arrays),
-        codecs.encode_exr(Z.copy()),
-        codecs.encode_png(RGB.copy()),
-    ) == first
+    assert (codecs.encode_npz(arrays), codecs.encode_exr(Z.copy()), codecs.encode_png(RGB.copy())) == first
 
 
 def test_npz_is_what_spline_loads(tmp_path: Path) -> None:
     points = np.tile(np.eye(4), (5, 1, 1))
     points[:, 0, 3] = RNG.random(5)
     files.atomic_write(
-        tmp_path / "s.npz",
-        codecs.encode_npz({"control_points": points, "t0": np.array(0.1), "dt": np.array(0.05)}),
+        tmp_path / "s.npz", codecs.encode_npz({"control_points": points, "t0": np.array(0.1), "dt": np.array(0.05)})
     )
     spline = Spline.load(tmp_path / "s.npz")
     np.testing.assert_array_equal(spline.control_points, points)
