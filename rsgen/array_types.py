@@ -1,4 +1,4 @@
-"""Names of the NumPy arrays that signatures speak of; a docstring tells the shape."""
+"""NumPy array types of signatures; docstrings give the shapes."""
 
 from __future__ import annotations
 

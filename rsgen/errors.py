@@ -1,4 +1,4 @@
-"""The one exception that means "the input is wrong": its message is one line that says what, where and how to mend."""
+"""The one exception that means "the input is wrong": its message is one line: what, where, and what to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writing figures as the file's suffix says."""
+"""Writing figures in the format of the file's suffix."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DPI = 130
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as its suffix says (.png, .jpg, .svg, .pdf) and close it. Raises UserError if that fails."""
+    """Write a figure in the format of its suffix (.png, .jpg, .svg, .pdf) and close it. Raises UserError."""
     kind = path.suffix.lower().removeprefix(".")
     if kind not in figure.canvas.get_supported_filetypes():
         raise UserError(f"{path}: pictures cannot be written as '{path.suffix}': choose .png, .jpg, .svg or .pdf")

@@ -1,7 +1,7 @@
 """The `rsgen` command: every function here is a command, its parameters are the command's arguments.
 
 argparse reads them (`console.command_line`): tyro and cyclopts, tried, take no YAML values such as [1, 2] and complain
-in boxes, pydantic-settings in tracebacks, and to mend that would take as much code.
+in boxes, pydantic-settings in tracebacks, and repairing that would take as much code.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Parser(Parser):
-    """Says of a field of the config that has moved what it is called now."""
+    """Names the new option of a field of the config that has moved."""
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         from rsgen.config.faults import moved_to
@@ -113,7 +113,7 @@ def scenes(
     json: Json = False,
 ) -> int:
     """List the scenes that ship: what each is, its size, configs, whether it is built and lit. With a name: more of
-    that one; with --out: build it there, with --seed in another arrangement, and print what a config says to render it.
+    that one; with --out: build it there, with --seed in another arrangement, and print what a config has to name.
     """
     from rsgen.produce.library import build_variant, describe_scene, list_scenes
 

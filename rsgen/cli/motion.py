@@ -21,7 +21,7 @@ def fit(
     json: Json = False,
 ) -> int:
     """Fit a spline to a trajectory: residuals and motion statistics."""
-    from rsgen.motion.fit_summary import plot_fit, summarise_fit
+    from rsgen.motion.statistics import plot_fit, summarise_fit
 
     summary = summarise_fit(file, dt, smoothing, format)
     if plot is not None:

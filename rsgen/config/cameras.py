@@ -125,7 +125,7 @@ class AutoExposureConfig(Section):
     step_ev: Annotated[float, Field(ge=0.01, le=4)] = Field(
         default=0.25, description="exposure times gain changes in steps of this, stops"
     )
-    speed: Annotated[float, Field(gt=0, le=1)] = Field(default=0.5, description="share of the error that is mended")
+    speed: Annotated[float, Field(gt=0, le=1)] = Field(default=0.5, description="share of the error that is corrected")
     lag_frames: int = Field(default=2, ge=1, le=100, description="frames from a picture to the first that it changes")
     exposure_s: tuple[ExposureSeconds, ExposureSeconds] = Field(
         default=(0.001, 0.033), description="shortest and longest exposure of a line, s"

@@ -112,19 +112,19 @@ class Config(Section):
 
     @property
     def declared_color(self) -> ColorConfig:
-        """What the sequence states of its colour camera: the truth, unless `faults.declared` says otherwise."""
+        """The colour camera that the sequence states: the true one, unless `faults.declared` replaces it."""
         declared = self.injected.declared
         return as_declared(self.color, None if declared is None else declared.color)
 
     @property
     def declared_depth(self) -> DepthConfig:
-        """What the sequence states of its depth camera: the truth, unless `faults.declared` says otherwise."""
+        """The depth camera that the sequence states: the true one, unless `faults.declared` replaces it."""
         declared = self.injected.declared
         return as_declared(self.depth, None if declared is None else declared.depth)
 
     @property
     def declared_T_color_depth(self) -> Matrix4:
-        """What the sequence states of the pose between the cameras."""
+        """The pose between the cameras that the sequence states."""
         declared = self.injected.declared
         return self.T_color_depth if declared is None or declared.T_color_depth is None else declared.T_color_depth
 

@@ -110,7 +110,7 @@ class MotionConfig(Section):
         if missing:
             raise ValueError(f"kind {self.kind} needs {' and '.join(missing)}")
         others = {name for kind in _NEEDED for name in (*_NEEDED[kind], *_OPTIONAL[kind])} - mine
-        fields = type(self).model_fields  # a default that is written out, as in sequence.yaml, says nothing
+        fields = type(self).model_fields  # a default that is written out, as in sequence.yaml, does not count
         if foreign := sorted(name for name in others if getattr(self, name) != fields[name].default):
             raise ValueError(f"{', '.join(foreign)}: not for kind {self.kind}: remove")
         fewest = 3 if self.closed else 2

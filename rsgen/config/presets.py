@@ -130,13 +130,13 @@ assert set(_IMU_PRESETS) == set(get_args(ImuPreset))
 
 
 def with_imu_preset(data: Any) -> Any:
-    """A section's data with what its `preset` says wherever they say nothing."""
+    """A section's data, completed by its `preset`."""
     name = data.get("preset") if isinstance(data, dict) else None
     return _IMU_PRESETS[name] | data if isinstance(name, str) and name in _IMU_PRESETS else data
 
 
 def with_presets(data: dict[str, Any]) -> dict[str, Any]:
-    """A config's data with what its presets say wherever the data say nothing; null switches a section off."""
+    """A config's data, completed by its presets; null switches a section off."""
     name = data.get("preset")
     data = _merged(_PRESETS[name], data) if isinstance(name, str) and name in _PRESETS else data
     imu = data.get("imu")

@@ -63,7 +63,7 @@ class SceneConfig(Section):
     @model_validator(mode="after")
     def _is_a_mesh_if_lit(self) -> SceneConfig:
         if self.file.suffix.lower() == ".xml" and self.light != "auto":
-            raise ValueError("light: is for mesh files: a Mitsuba scene says that itself")
+            raise ValueError("light: is for mesh files: a Mitsuba scene has its own light")
         return self
 
 

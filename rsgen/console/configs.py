@@ -1,7 +1,7 @@
 """Configs by name: those of the checkout, used where they are, or those that came with the wheel.
 
 A wheel carries configs/ and the scripts of scenes/ in the package's folder `share`. They are copied into
-$XDG_CACHE_HOME/rsgen (~/.cache/rsgen) before they are used, so that scenes are built, lit and kept there.
+$XDG_CACHE_HOME/rsgen (~/.cache/rsgen) before they are used, so that scenes are built, lit and stored there.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def configs_folder() -> Path:
 
 
 def user_cache() -> Path:
-    """Where large results are kept that have no better place."""
+    """Folder for large results that have no better place."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rsgen"
 
 

@@ -128,7 +128,7 @@ def plan_tour(
         after = max(int(np.searchsorted(passes, s[worst] + 1e-6)) - 1, 0)
         if distance[worst] < 1e-6:
             break
-        # One push for each stretch that is too close, from the last to the first so that indices stay valid.
+        # One push for each part of the curve that is too close, from the last to the first so that indices stay valid.
         starts = np.flatnonzero(close & ~np.r_[False, close[:-1]])
         for begin in starts[::-1]:
             end = begin + int(np.argmin(np.r_[close[begin:], False]))

@@ -29,7 +29,7 @@ Robust = Literal["huber", "none"]
 
 MAX_CONTROL_POINTS = 1_000_000
 HUBER_FACTOR = 8.0
-"""Poses farther from the spline than this many median residuals pull with constant force only."""
+"""Poses farther from the spline than this many median residuals count with constant force only."""
 
 _ROWS = 24  # stored diagonals of the normal equations: four control points of six
 _MAX_ITERATIONS = 200
@@ -47,7 +47,7 @@ class FitResult:
 
     residual_trans_m (n,): distance of the spline's position from the measured one, metres.
     residual_rot_rad (n,): angle between the orientations, radians.
-    weights (n,): 1, or less where Huber's kernel limits a pose's pull. iterations: Gauss-Newton steps taken.
+    weights (n,): 1, or less where Huber's kernel limits a pose's influence. iterations: Gauss-Newton steps taken.
     """
 
     spline: Spline
@@ -108,7 +108,10 @@ def fit_spline(
     scale = np.array([1.0] * 3 + [metres_per_radian] * 3)
     smooth = smoothing * len(stamps) / ((stamps[-1] - stamps[0]) * dt**3)
     loose = _loose_knots(stamps, first * dt, dt, count)
-    spline = Spline(_interpolate(trajectory, dt * np.arange(first - 1, last + 2)), first * dt, dt)
+    # The start: constant twist between neighbouring poses, at rest outside the stamps.
+    knots = np.clip(dt * np.arange(first - 1, last + 2), stamps[0], stamps[-1])
+    start = se3.orthonormalise(se3.interpolated(stamps, trajectory.T_world_cam, knots))
+    spline = Spline(start, first * dt, dt)
 
     threshold, prior = math.inf, np.full((count - 2, 6), _WEAK_PRIOR)
     r, bend = _residuals(trajectory, spline) * scale, _second_differences(spline) * scale
@@ -268,16 +271,7 @@ def _prior(r: FloatArray, bend: FloatArray, loose: BoolArray) -> FloatArray:
     return weights
 
 
-# --- start and checks ------------------------------------------------------------------------------------------------
-
-
-def _interpolate(trajectory: Trajectory, times: FloatArray) -> FloatArray:
-    """(m, 4, 4) poses at (m,) times by constant twist between neighbours, at rest outside the stamps."""
-    stamps, T = trajectory.stamps, trajectory.T_world_cam
-    times = np.clip(times, stamps[0], stamps[-1])
-    k = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 2)
-    u = (times - stamps[k]) / (stamps[k + 1] - stamps[k])
-    return se3.orthonormalise(T[k] @ se3.exp(u[:, None] * se3.log(se3.inverse(T[k]) @ T[k + 1])))
+# --- checks ----------------------------------------------------------------------------------------------------------
 
 
 def _check(

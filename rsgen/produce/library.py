@@ -46,6 +46,11 @@ class ShippedScene:
     configs: tuple[Path, ...]
 
     @property
+    def config_names(self) -> str:
+        """Names of its configs in one line."""
+        return " ".join(file.stem for file in self.configs) or "none yet"
+
+    @property
     def how_to_vary(self) -> str:
         """The command that builds another such scene, or that there is none."""
         return f"rsgen scenes {self.name} --seed N --out DIR" if self.takes_seed else "takes no seed"
@@ -62,14 +67,6 @@ class Contents:
 
 
 @dataclass(frozen=True)
-class Room:
-    """The largest floor of a scene: its height y and the free height above it, m; None: without a ceiling."""
-
-    floor_y: float
-    free_height: float | None
-
-
-@dataclass(frozen=True)
 class Listing:
     """Scenes with their contents, None where they are not built."""
 
@@ -81,8 +78,7 @@ class Listing:
         blocks = []
         for scene, contents in self.entries:
             lines = [f"{scene.name}: {scene.about}", f"  {_built_text(contents)}"]
-            lines.append(f"  configs: {' '.join(file.stem for file in scene.configs) or 'none yet'}")
-            lines.append(f"  another by seed: {scene.how_to_vary}")
+            lines += [f"  configs: {scene.config_names}", f"  another by seed: {scene.how_to_vary}"]
             blocks.append("\n".join(lines))
         return "\n".join([*blocks, f"in {self.folder} (rsgen scenes NAME tells more of one)"])
 
@@ -93,35 +89,37 @@ class Listing:
 
 @dataclass(frozen=True)
 class Description:
-    """One scene in full; contents and room are None where it is not built."""
+    """One scene in full. floor: y of its largest floor and the free height above it, m, None without a ceiling.
+
+    contents, floor: None where it is not built.
+    """
 
     scene: ShippedScene
     contents: Contents | None
-    room: Room | None
+    floor: tuple[float, float | None] | None
 
     def text(self) -> str:
         """A line a fact."""
-        scene, contents, room = self.scene, self.contents, self.room
+        scene, contents = self.scene, self.contents
         rows = [("what", scene.about), ("file", str(scene.file)), ("script", str(scene.script))]
         rows.append(("built", _built_text(contents)))
-        if room is not None:
-            high = "no ceiling" if room.free_height is None else f"{room.free_height:.2f} m free above it"
-            rows.append(("floor", f"at y = {room.floor_y:.3f} m, {high}"))
+        if self.floor is not None:
+            y, height = self.floor
+            high = "no ceiling" if height is None else f"{height:.2f} m free above it"
+            rows.append(("floor", f"at y = {y:.3f} m, {high}"))
         if contents is not None:
             rows.append(("materials", f"{len(contents.materials)}: {' '.join(contents.materials)}"))
-        rows.append(("configs", " ".join(file.stem for file in scene.configs) or "none yet"))
-        rows.append(("another", scene.how_to_vary))
+        rows += [("configs", scene.config_names), ("another", scene.how_to_vary)]
         rows.append(("a tour", f"rsgen motion suggest {scene.file} --seed N --out my.yaml"))
         return Table((scene.name, ""), tuple(rows), words=(0, 1)).text()
 
     def as_dict(self) -> dict[str, Any]:
         """The same as plain values, m."""
-        room = self.room
+        y, height = self.floor or (None, None)
         return {
             "name": self.scene.name, **_facts(self.scene, self.contents),
             "materials": None if self.contents is None else list(self.contents.materials),
-            "floor_y_m": None if room is None else room.floor_y,
-            "free_height_m": None if room is None else room.free_height,
+            "floor_y_m": y, "free_height_m": height,
         }  # fmt: skip
 
 
@@ -146,13 +144,9 @@ def shipped_scenes(folder: Path, configs: Path) -> list[ShippedScene]:
             continue
         is_main = script.name == "build.py"
         file = script.with_name("scene.xml") if is_main else script.with_suffix(".xml")
-        arguments = [a.arg for a in (*build.args.args, *build.args.kwonlyargs)]
-        found.append(
-            ShippedScene(
-                script.parent.name if is_main else script.stem, _about(tree), script, file, "seed" in arguments,
-                tuple(users.get(file.resolve(), ())),
-            )
-        )  # fmt: skip
+        takes_seed = "seed" in (a.arg for a in (*build.args.args, *build.args.kwonlyargs))
+        name, used_by = script.parent.name if is_main else script.stem, tuple(users.get(file.resolve(), ()))
+        found.append(ShippedScene(name, _about(tree), script, file, takes_seed, used_by))
     return sorted(found, key=lambda scene: scene.name)
 
 
@@ -165,18 +159,17 @@ def list_scenes() -> Listing:
 
 def find_scene(name: str) -> ShippedScene:
     """The scene that is called so. Raises UserError naming those that there are."""
-    scenes = shipped_scenes(scenes_folder(), configs_folder())
-    for scene in scenes:
-        if scene.name == name:
-            return scene
-    raise UserError(f"scene '{name}': no such scene ships: choose {', '.join(scene.name for scene in scenes)}")
+    scenes = {scene.name: scene for scene in shipped_scenes(scenes_folder(), configs_folder())}
+    if name not in scenes:
+        raise UserError(f"scene '{name}': no such scene ships: choose {', '.join(scenes)}")
+    return scenes[name]
 
 
 def describe_scene(name: str) -> Description:
     """One scene in full. Raises UserError for an unknown name."""
     scene = find_scene(name)
     contents = _contents(scene)
-    return Description(scene, contents, None if contents is None else _room(scene.file))
+    return Description(scene, contents, None if contents is None else _largest_floor(scene.file))
 
 
 def build_variant(name: str, seed: int | None, out: Path) -> Path:
@@ -291,8 +284,8 @@ def _lit(scene: ShippedScene) -> tuple[int, int]:
     return sum((folder / f"irradiance-{key}.npz").is_file() for key in keys), len(keys)
 
 
-def _room(file: Path) -> Room | None:
-    """The largest floor of a built scene with a ceiling over it, as `motion suggest` finds it; without one, of all."""
+def _largest_floor(file: Path) -> tuple[float, float | None] | None:
+    """`Description.floor` of a built scene: of floors with a ceiling, as `motion suggest` finds them, else of all."""
     from rsgen.motion.floor_plan import find_floors
     from rsgen.render.meshes import surface
     from rsgen.render.rays import cast_rays
@@ -304,4 +297,4 @@ def _room(file: Path) -> Room | None:
     if not floors:
         return None
     floor = next((floor for floor in floors if np.isfinite(floor.gap_m)), floors[0])  # a roof is larger than a room
-    return Room(floor.y, floor.gap_m if np.isfinite(floor.gap_m) else None)
+    return floor.y, floor.gap_m if np.isfinite(floor.gap_m) else None

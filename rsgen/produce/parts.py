@@ -34,7 +34,7 @@ log = logging.getLogger("rsgen")
 
 # About 12 days. Up to here a float64 tells 0.1 ns apart; in Unix time 0.24 us, half a percent of a line delay.
 _LARGEST_STAMP_S = 1e6
-_LOOKS = 64  # instants that lines of sight are taken at, and as many lines each
+_INSTANTS = 64  # of lines of sight, and as many lines at each
 _LIGHT_STEP_S = 0.1  # between the places along an object's path at which light is gathered
 _LEAST_MIRRORED = 4
 
@@ -104,9 +104,9 @@ def lines_of_sight(config: Config) -> tuple[FloatArray, FloatArray]:
     motion = load_motion(config)
     camera = config.color.camera
     rng = np.random.default_rng(config.seed)
-    stamps = rng.uniform(motion.first_stamp, motion.last_stamp, _LOOKS)
+    stamps = rng.uniform(motion.first_stamp, motion.last_stamp, _INSTANTS)
     T_world_color = motion.spline.pose(stamps) @ se3.inverse(np.asarray(config.T_color_depth, float))
-    pixels = rng.uniform(-0.5, (camera.width - 0.5, camera.height - 0.5), (_LOOKS, _LOOKS, 2))
+    pixels = rng.uniform(-0.5, (camera.width - 0.5, camera.height - 0.5), (_INSTANTS, _INSTANTS, 2))
     ray = camera.unproject(pixels)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     direction = np.einsum("nij,nkj->nki", T_world_color[:, :3, :3], ray)
@@ -235,8 +235,8 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, obj
         cache = cache_folder(config.scene.file)
         field = baked_field(scene, surfaces_hash(config), light, cache, progress, lambda: lines_of_sight(config))
     except UserError as error:
-        told = str(error)
-        raise UserError(told if told.startswith("scene ") else f"scene {config.scene.file}: {told}") from None
+        text = str(error)
+        raise UserError(text if text.startswith("scene ") else f"scene {config.scene.file}: {text}") from None
     things = _lit_objects(scene, field, load_meshes(config.objects), objects) if objects else None
     return BakedIntegrator(field, glossy_spp=mirrored_samples(light, config.color.spp), objects=things)
 

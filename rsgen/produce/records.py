@@ -76,7 +76,7 @@ def describe(
     versions: Mapping[str, str],
     inputs: Mapping[str, str],
 ) -> dict[str, Any]:
-    """What sequence.yaml says. stamps: (n,) s of all frames of each stream."""
+    """Content of sequence.yaml. stamps: (n,) s of all frames of each stream."""
     color, depth, faults = config.declared_color, config.declared_depth, config.injected
     depth_only = {"depth_scale": depth.depth_scale} | ({"registered": True} if depth.registered else {})
     identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
@@ -100,7 +100,7 @@ def describe(
 
 
 def true_cameras(config: Config) -> Cameras:
-    """The cameras that take the images, whatever `faults.declared` says."""
+    """The cameras that take the images, whatever `faults.declared` states."""
     color, depth = config.color, config.depth
     T_color_depth = np.array(config.T_color_depth, float)
     return Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)

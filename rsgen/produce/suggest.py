@@ -206,7 +206,7 @@ def wish_like(config: Config, wish: Wish) -> Wish:
 
 
 def _sections(scene: TourScene, like: Config | None) -> dict[str, Any]:
-    """What a config says beside its motion and scene: coarser light in a large one, and the cameras of another."""
+    """Sections of a config beside motion and scene: coarser light in a large one, and the cameras of another."""
     given = {} if like is None else like.model_dump(mode="json", include=set(_CAMERAS), exclude_unset=True)
     area = float((trimesh.triangles.area(scene.triangles) * scene.fineness**2).sum())
     if area > _LARGE_M2:
@@ -239,7 +239,7 @@ def _config(
 
 
 def _exposed(loaded: Any, config: Config, spline: Spline) -> tuple[Config, tuple[str, ...]]:
-    """The config with an exposure for the scene's light, where the one it has is far off, and what to say of it."""
+    """The config with an exposure for the scene's light, where the one it has is far off, and a note on it."""
     assert config.motion is not None
     if not loaded.emitters():
         return config, ("it has no light, and what it shows is black: add an emitter",)

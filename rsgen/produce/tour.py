@@ -21,7 +21,7 @@ from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import ViewContents, free_region
 from rsgen.produce.frame_source import small_camera
 
-REACH_M = 1.0  # so near a surface's distance is told
+REACH_M = 1.0  # surfaces farther off are not reported
 _LARGEST_THING_M = 50.0
 _SEEN_M = (0.4, 5.0)
 _VIEWS = 40
@@ -226,7 +226,7 @@ def likely_unit(height: float) -> tuple[str, float]:
 
 
 def doubt(height_m: float, scale: float) -> str:
-    """What to say of a room that high, taken at so many metres per unit: nothing if rooms are, or without a ceiling."""
+    """A note on a room too high to be in metres, at so many metres per unit; '' for others and without a ceiling."""
     if not _ROOMS_M[1] < height_m < math.inf:
         return ""
     return f"; if that is too high, --scale {scale * _ROOM_M / height_m:.2g} makes it {_ROOM_M:g} m"

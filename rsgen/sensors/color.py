@@ -96,9 +96,9 @@ def vignetting(width: int, height: int, corner_loss: float) -> Float32Array:
     u, v = np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2
     r2 = u**2 + v[:, None] ** 2
     corner = (1.0 - corner_loss) ** -0.5 - 1.0  # tan² θ there
-    falloff = ((1.0 + corner * r2 / r2[0, 0]) ** -2).astype(np.float32)
-    falloff.flags.writeable = False
-    return falloff
+    share = ((1.0 + corner * r2 / r2[0, 0]) ** -2).astype(np.float32)
+    share.flags.writeable = False
+    return share
 
 
 def add_sensor_noise(

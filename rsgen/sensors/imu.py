@@ -4,7 +4,7 @@ Specific force and angular rate in the IMU's frame, at the IMU's place (lever ar
     gyro = M_g ω + b_g + n_g,      accel = M_a (a − g) + b_a + n_a,      both clipped to the sensor's range.
 Noise as Kalibr and the EuRoC sets state it, by continuous-time densities (Kalibr's wiki, "IMU Noise Model"): white
 noise of density σ sampled at rate f has the standard deviation σ √f, a bias that diffuses with density σ_b takes steps
-of standard deviation σ_b / √f. While the unit warms up a bias drifts by A (1 − exp(−t/τ)) beside that.
+of standard deviation σ_b / √f. While the IMU warms up a bias drifts by A (1 − exp(−t/τ)) beside that.
 Samples may come late or early, be lost, and bear the stamps of a clock of their own; values are those of true times.
 """
 
@@ -49,7 +49,7 @@ IMU_CSV_HEADER = (
 class ImuSamples:
     """n samples: t (n,) s; gyro (n, 3) rad/s and accel (n, 3) m/s² in the IMU's frame; the biases (n, 3) within them.
 
-    A resting accelerometer reads −g: the specific force. t: when they were taken; stamps (n,): what the unit says, s.
+    A resting accelerometer reads −g: the specific force. t: when they were taken; stamps (n,): by the IMU's clock, s.
     """
 
     t: FloatArray
@@ -133,7 +133,7 @@ def simulate_imu(
         force @ np.array(config.accelerometer_matrix).T + accel_bias + accel_noise, config.accelerometer_range
     )
     stamps = _stamped(t, start, config.rate_hz, faults, seed)
-    kept = _kept(count, faults, seed)
+    kept = _arriving(count, faults, seed)
     return ImuSamples(t[kept], gyro[kept], accel[kept], gyro_bias[kept], accel_bias[kept], stamps[kept])
 
 
@@ -177,14 +177,14 @@ def _bounded(count: int, sigma: float, rate_hz: float, rng: np.random.Generator)
 
 
 def _stamped(t: FloatArray, start: float, rate_hz: float, faults: ImuFaults, seed: int) -> FloatArray:
-    """What the unit's own clock says at times t (n,), s; t itself where that is the images' clock."""
+    """Times t (n,) by the IMU's own clock, s; t itself where that is the images' clock."""
     if not (faults.clock_offset_s or faults.clock_drift_ppm or faults.stamp_error_s):
         return t
     error = _bounded(len(t), faults.stamp_error_s, rate_hz, _generator(seed, _STAMPS))
     return round_stamps(t + faults.clock_offset_s + 1e-6 * faults.clock_drift_ppm * (t - start) + error)
 
 
-def _kept(count: int, faults: ImuFaults, seed: int) -> npt.NDArray[np.bool_]:
+def _arriving(count: int, faults: ImuFaults, seed: int) -> npt.NDArray[np.bool_]:
     """Which samples (count,) arrive: losses begin anywhere and last for geometrically many."""
     kept = np.ones(count, bool)
     if faults.dropped:

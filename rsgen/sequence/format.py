@@ -38,7 +38,7 @@ DEPTH_OBJECT_IDS = "truth/depth_object_ids"  # the same of depth frames
 OBJECT_CHANNELS = ("id",)
 CLEAN_COLOR = "color"  # truth/color/: what a colour camera without noise would have reported
 GROUND_TRUTH_HZ = 200.0
-DEPTH_SCALE = 5000.0  # units per metre of depth images, unless told otherwise: as TUM's and ICL-NUIM's
+DEPTH_SCALE = 5000.0  # units per metre of depth images, unless stated otherwise: as TUM's and ICL-NUIM's
 STAMP_TOLERANCE_S = 1e-6
 _FRAMES_AT_ONCE = 16  # poses of so many frames' lines are evaluated together: flat memory, little overhead
 

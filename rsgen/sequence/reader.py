@@ -82,7 +82,7 @@ class Sequence:
 
     Cameras are as sequence.yaml declares them; where that is wrong on purpose, `as_taken` has the true ones.
     Frames are counted as listed: k-th line of rgb.txt or depth.txt. Every reading method raises UserError naming the
-    file if it is missing, damaged or of another size than sequence.yaml says.
+    file if it is missing, damaged or of another size than in sequence.yaml.
     """
 
     root: Path
@@ -273,7 +273,7 @@ def _table_of(root: Path, name: StreamName, indices: IntArray) -> FrameTable:
 
 
 def _frame_number(listing: Path, line: Line, yaml: StreamYaml) -> int:
-    """Frame number of a listed file, which its name tells."""
+    """Frame number of a listed file, from its name."""
     where, stem = f"{listing} line {line.number}", Path(line.path).stem
     if not (stem.isascii() and stem.isdigit() and len(stem) <= 9 and int(stem) < yaml.frames):
         raise UserError(f"{where}: {line.path!r} is not one of the sequence's {yaml.frames} frames")

@@ -14,8 +14,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import FitResult, fit_spline
-from rsgen.motion.fit_summary import plot_fit, summarise_fit
-from rsgen.motion.statistics import motion_statistics
+from rsgen.motion.statistics import motion_statistics, plot_fit, summarise_fit
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
 ICL = Path(__file__).resolve().parents[4] / "shared" / "data" / "icl_nuim_livingroom"
