@@ -22,11 +22,12 @@ EXPORTS = {
     "rerun": ("rerun", "{}.rrd", ".rrd recording"),
 }  # fmt: skip
 # Scene files that a config may name, by suffix; the core itself reads .xml. trimesh knows more than are listed.
-SCENES = dict.fromkeys((".glb", ".gltf", ".obj", ".ply", ".stl"), "meshes.mesh_file")
+_MESHES = (".glb", ".gltf", ".obj", ".ply", ".stl")
+SCENES = dict.fromkeys(_MESHES, "meshes.mesh_file")
 _OTHER_SCENES = "meshes.mesh_file"
 # Files that rsgen import-scene makes a Mitsuba scene of, by suffix.
 IMPORTS = dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "scenes.usd_stage")
-IMPORTS |= {".blend": "scenes.blend", **dict.fromkeys(SCENES, "scenes.import_scene")}
+IMPORTS |= {".blend": "scenes.blend", **dict.fromkeys(_MESHES, "scenes.import_scene")}
 # What a Mitsuba scene may hold that Mitsuba 3 itself does not take.
 _XML = {"older version": "mitsuba_xml.upgrade", "mesh files": "mitsuba_xml.mesh_files"}
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,14 +14,17 @@ from PIL import Image
 from rendering import dr, mi
 from usd_scenes import albedo, imported, triangles
 
-from rsgen import srgb
+from rsgen import formats, srgb
 from rsgen.cli.main import main
 from rsgen.errors import UserError
+from rsgen.formats.meshes.mesh_file import part_shapes
+from rsgen.formats.meshes.parts import Part
 from rsgen.formats.polygons import triangulate
 from rsgen.formats.scenes import content
 from rsgen.formats.scenes.import_scene import write_folder, write_scene
 from rsgen.render.material import Material, Texture, bsdf
-from rsgen.render.scene import load_scene
+from rsgen.render.placement import SceneOptions
+from rsgen.render.scene import content_hash, load_scene
 
 
 def test_polygons_of_a_mesh_keep_their_area_and_order_and_holes_are_left_out() -> None:
@@ -123,3 +129,29 @@ def test_colours_survive_as_bytes() -> None:
     """What the PNGs rest on: sRGB's bytes, decoded and encoded again, are the same bytes."""
     codes = np.arange(256)
     np.testing.assert_array_equal(np.round(srgb.encode(srgb.decode(codes / 255)) * 255), codes)
+
+
+def test_another_kind_of_scene_is_one_module_and_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of scene.file and of import-scene: boxes as lines of numbers, by the lines in the registry."""
+    module: Any = ModuleType("rsgen.formats.meshes.boxes")
+
+    def parts(path: Path, scale: float) -> list[Part]:
+        boxes = [trimesh.creation.box(extents=scale * row) for row in np.loadtxt(path, ndmin=2)]
+        return [Part(np.asarray(box.vertices), np.asarray(box.faces), Material()) for box in boxes]
+
+    module.scene_dict = lambda mi, path, scratch, options: {
+        "type": "scene",
+        **part_shapes(mi, parts(path, options.scale), scratch),
+    }
+    module.hash_into = lambda digest, path, options: digest.update(repr(options.scale).encode())
+    module.read_content = lambda path, scale, up: content.Content(parts(path, scale or 1.0), [], ["boxes"])
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    for table in (formats.SCENES, formats.IMPORTS):
+        monkeypatch.setitem(table, ".boxes", "meshes.boxes")
+    file = tmp_path / "three.boxes"
+    file.write_text("1 2 3\n2 2 2\n1 1 1\n")
+    direct = load_scene(file, options=SceneOptions(scale=0.5))
+    scene, notes = imported(file, scale=0.5)
+    assert len(triangles(direct)) == 36 and notes[0] == "boxes"
+    np.testing.assert_array_equal(triangles(scene), triangles(direct))
+    assert content_hash(file) != content_hash(file, SceneOptions(scale=0.5))
