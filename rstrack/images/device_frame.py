@@ -18,6 +18,7 @@ from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rstrack.data.moving_masks import Mask
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import (
@@ -36,8 +37,6 @@ from rstrack.options import Options
 
 # Frames within which the depth camera's resolution is looked for: it does not change.
 _SETTLED = 3
-
-Mask = npt.NDArray[np.bool_]
 
 MARGIN = 0.0125
 """Part of the width about what moves within which colours may be its own: they are taken later, and from beside."""

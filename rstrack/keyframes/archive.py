@@ -28,7 +28,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class _Entry:
+class _StoredArrays:
     """Arrays; None where they are in `file` only. number: of this version of them, counted over all that were added."""
 
     arrays: Arrays | None
@@ -52,7 +52,7 @@ class SpilledArrays:
     name: str
     most_bytes: float
     folder: Path | None = None
-    _entries: dict[int, _Entry] = field(default_factory=dict)
+    _entries: dict[int, _StoredArrays] = field(default_factory=dict)
     _size: int = 0
     _added: int = 0
     _temporary: TemporaryDirectory[str] | None = None
@@ -83,7 +83,7 @@ class SpilledArrays:
             if before.file is not None and self.folder is None:
                 before.file.unlink(missing_ok=True)
         self._added += 1
-        self._entries[number] = entry = _Entry(arrays, self._added)
+        self._entries[number] = entry = _StoredArrays(arrays, self._added)
         self._size += entry.size
         for k, each in list(self._entries.items()):
             if self._size <= self.most_bytes:
@@ -108,7 +108,7 @@ class SpilledArrays:
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise UserError(f"{entry.file}: images of a keyframe cannot be read again ({error})") from None
 
-    def _written(self, number: int, entry: _Entry) -> _Entry:
+    def _written(self, number: int, entry: _StoredArrays) -> _StoredArrays:
         """With its arrays in a file too, of a name of its own: a checkpoint may mean an earlier version."""
         if entry.file is not None or entry.arrays is None:
             return entry

@@ -16,7 +16,8 @@ from rstrack.alignment import brightness
 from rstrack.alignment.brightness import factor_and_offset, relative
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
-from rstrack.images.device_frame import DeviceFrame, Mask
+from rstrack.data.moving_masks import Mask
+from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore

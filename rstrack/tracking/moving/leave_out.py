@@ -21,7 +21,8 @@ from rstrack.alignment.free_space import Free, FreeSpace, Grid, SeenFrom, grid_o
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH
-from rstrack.images.device_frame import Mask, full_size, without_pixels
+from rstrack.data.moving_masks import Mask
+from rstrack.images.device_frame import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import Reference, strides

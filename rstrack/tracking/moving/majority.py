@@ -20,7 +20,8 @@ from rsgen.device.arrays import Engine
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.free_space import grid_shape
-from rstrack.images.device_frame import DeviceFrame, Mask
+from rstrack.data.moving_masks import Mask
+from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import ColorImage
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import FloatImage, on_one_surface, surface_slopes

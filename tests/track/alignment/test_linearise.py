@@ -265,28 +265,22 @@ def test_pixels_whose_interpolation_errs_by_more_than_a_quarter_of_sigma_weigh_l
     assert 0.3 < half < 0.7
 
 
-def test_scales_have_floors() -> None:
-    depth, color = frontal(), frontal("photometric")
-    for s, floor, sigma in ((depth, 2e-4, 1e-3), (color, 1.0 / 255.0, 0.02)):
-        lin = s.term(s.truth, sigma)
-        assert lin.floor == floor
-        for _ in range(5):
-            lin = s.term(s.truth, lin.next_sigma)
-        assert lin.next_sigma == floor  # errors are smaller than that
-        worse = s.term(disturbed(s.truth, 3, 0.01), sigma).next_sigma
-        assert worse > 2.0 * floor
-
-
-def test_rounding_of_depth_is_a_floor_too() -> None:
-    s = frontal()
-    assert isinstance(s.image, DepthImage)
-    median_depth = s.ref.median_depth
-    for step in (1e-4, 1e-3):  # 1/m
-        coarse = replace(s, image=replace(s.image, resolution=step))
-        want = max(2e-4, step * median_depth**2 / np.sqrt(12.0))
-        lin = coarse.term(s.truth, 1e-3)
-        assert lin.floor == pytest.approx(want) and lin.next_sigma >= want
-    assert want > 1e-3  # the second one counted, the first did not
+@pytest.mark.parametrize(
+    ("kind", "step", "floor"),
+    [("photometric", 0.0, 1.0 / 255.0), ("geometric", 0.0, 2e-4), ("geometric", 1e-4, 2e-4), ("geometric", 1e-3, None)],
+)
+def test_scales_have_floors_and_rounding_of_depth_is_one(kind: str, step: float, floor: float | None) -> None:
+    s = frontal(kind)
+    if isinstance(s.image, DepthImage):
+        s = replace(s, image=replace(s.image, resolution=step))  # 1/m
+    want = step * s.ref.median_depth**2 / np.sqrt(12.0) if floor is None else floor
+    sigma = 1e-3 if kind == "geometric" else 0.02
+    lin = s.term(s.truth, sigma)
+    assert lin.floor == pytest.approx(want) and (floor is not None or want > 1e-3)
+    for _ in range(5):
+        lin = s.term(s.truth, lin.next_sigma)
+    assert lin.next_sigma == lin.floor  # errors are smaller than that
+    assert s.term(disturbed(s.truth, 3, 0.01), sigma).next_sigma > (2.0 if floor else 1.0) * lin.floor
 
 
 @pytest.mark.parametrize(("share", "shown"), [(0.97, True), (0.955, False), (0.0, True)])

@@ -26,9 +26,10 @@ from rsgen.geometry.shutter import project_rolling
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.free_space import FreeSpace, SeenFrom, grid_of
 from rstrack.alignment.spline_state import SplineState
+from rstrack.data.moving_masks import Mask
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.images import line_poses as lines
-from rstrack.images.device_frame import DeviceRig, Mask, untimed, without_pixels
+from rstrack.images.device_frame import DeviceRig, untimed, without_pixels
 from rstrack.options import Options
 from rstrack.tracking.moving.leave_out import moving, moving_with
 from rstrack.tracking.moving.majority import not_with_most
