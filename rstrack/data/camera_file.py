@@ -27,24 +27,20 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from rsgen.array_types import FloatArray
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_text, read_yaml
-from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
-from rsgen.limits import rigid
 from rsgen.sequence.format import DEPTH_SCALE
 from rstrack.data.estimate import read_info
 from rstrack.data.kalibr_camera_file import Camchain, is_camchain, read_camchain
 from rstrack.data.opencv_camera_file import is_opencv, opencv_content
 from rstrack.data.registration import DepthSensor, registered_shutter
-from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Rig, sigma_of_file
+from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Rig, rigid_transform, sigma_of_file
 from rstrack.data.timing import StampsMode
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
 _KEYS = "color, depth, T_color_depth, stamps, clocks and sigma, each camera with width, height, intrinsics, readout_s"
-_ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
 
 Size = tuple[int, int]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -234,7 +230,7 @@ def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
         depth, streams = data.depth, [stream for stream in (data.color, data.depth) if stream is not None]
         color_camera, color_shutter = data.color.camera("color"), data.color.shutter
         depth_camera = color_camera if depth is None else depth.camera("depth")
-        T_color_depth = _extrinsic(data.T_color_depth, "T_color_depth")
+        T_color_depth = rigid_transform("T_color_depth", data.T_color_depth or np.eye(4))
         depth_shutter, late_s, notes = _depth_shutter(depth, depth_camera, color_shutter)
     except (UserError, ValidationError) as error:
         raise UserError(f"{path}: {_first(error) if isinstance(error, ValidationError) else error}") from None
@@ -278,17 +274,9 @@ def _depth_shutter(
         return depth.shutter, 0.5 * color.readout_s, (note,)
     if depth.sensor is None:
         return depth.shutter, 0.0, ()
-    T = _extrinsic(depth.sensor.T_color_sensor, "depth.sensor.T_color_sensor")
+    T = rigid_transform("depth.sensor.T_color_sensor", depth.sensor.T_color_sensor or np.eye(4))
     sensor = DepthSensor(depth.sensor.camera("depth.sensor"), depth.shutter, T)
     return *registered_shutter(camera, sensor), ()
-
-
-def _extrinsic(T: Matrix4 | None, name: str) -> FloatArray:
-    """T (4, 4), its rotation made orthonormal to the last digit. Raises UserError if it is not a rigid transform."""
-    try:
-        return se3.orthonormalise(rigid(np.eye(4) if T is None else T, _ROTATION_TOLERANCE))
-    except ValueError as error:
-        raise UserError(f"{name}: {error}") from None
 
 
 def _first(error: ValidationError) -> str:

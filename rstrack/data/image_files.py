@@ -24,7 +24,7 @@ from rsgen.inputs import MOST_PIXELS, image_size
 from rstrack.data.rig import Frame, Image, Rig
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_PNG_START = b"\x89PNG"
+PNG_START = b"\x89PNG\r\n\x1a\n"
 # Damaged images at the start of a recording before it is given up.
 _TRIED = 10
 # Repeats in a row beyond which a camera is taken to be at rest in a world without noise.
@@ -99,26 +99,33 @@ def decode_image(path: Path) -> npt.NDArray[Any]:
     Files are checked first, because decoders complain on stderr, and some return half a picture.
     """
     data = read_bytes(path)
-    if data.startswith(_PNG_START):
+    fault = image_fault(data)
+    image = None if fault else decoded(data)
+    if image is None:
+        raise UserError(f"{path}: is not a whole image ({fault or 'cannot be decoded'}): unpack the dataset again")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise UserError(f"{path}: has pixels of type {image.dtype}, expected 8-bit colour or 16-bit depth")
+    return image
+
+
+def image_fault(data: bytes) -> str | None:
+    """Why bytes are no whole PNG or JPEG of a size that is decoded; None where they are."""
+    if data.startswith(PNG_START):
         fault = png_fault(data)
     elif data.startswith(_JPEG_START):
         fault = None if _JPEG_END in data[-64:] else "truncated"
     else:
         fault = "neither PNG nor JPEG"
     width, height = image_size(data) or (0, 0)
-    if fault is None and width * height > MOST_PIXELS:
-        fault = f"it claims {width}x{height} pixels"
-    image = None
-    if fault is None:
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            fault = "cannot be decoded"
-    if image is None:
-        raise UserError(f"{path}: is not a whole image ({fault or 'cannot be decoded'}): unpack the dataset again")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise UserError(f"{path}: has pixels of type {image.dtype}, expected 8-bit colour or 16-bit depth")
-    return image
+    return fault or (f"it claims {width}x{height} pixels" if width * height > MOST_PIXELS else None)
+
+
+def decoded(data: bytes) -> npt.NDArray[Any] | None:
+    """The image as OpenCV has it, of bytes without a fault; None where it cannot be decoded."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
 
 
 def decode_color(path: Path) -> ByteArray:

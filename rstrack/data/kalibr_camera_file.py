@@ -25,7 +25,7 @@ from rsgen.errors import UserError, first_problem
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Shutter
-from rsgen.limits import rigid
+from rstrack.data.rig import rigid_transform
 
 _MODELS: dict[tuple[str, str], Model] = {
     ("pinhole", "none"): "pinhole",
@@ -35,7 +35,6 @@ _MODELS: dict[tuple[str, str], Model] = {
 }
 _KNOWN = "pinhole with radtan, equidistant or none, and ds with none"
 _DEPTH, _COLOR = re.compile(r"depth|infra|(^|/)ir(/|$)"), re.compile(r"colou?r|rgb")
-_RIGID = 1e-3
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Pixels = Annotated[int, Field(ge=1, le=16384)]
@@ -139,10 +138,10 @@ def _chain(path: Path, cams: dict[str, _Cam]) -> dict[str, FloatArray]:
     for before, name in zip(list(cams), list(cams)[1:], strict=False):
         cam, first = cams[name], cams["cam0"]
         if cam.T_cn_cnm1 is not None:
-            T[name] = _rigid(path, f"{name}.T_cn_cnm1", cam.T_cn_cnm1) @ T[before]
+            T[name] = rigid_transform(f"{path}: {name}.T_cn_cnm1", cam.T_cn_cnm1) @ T[before]
         elif cam.T_cam_imu is not None and first.T_cam_imu is not None:
-            T_cam0_imu = _rigid(path, "cam0.T_cam_imu", first.T_cam_imu)
-            T[name] = _rigid(path, f"{name}.T_cam_imu", cam.T_cam_imu) @ se3.inverse(T_cam0_imu)
+            T_cam0_imu = rigid_transform(f"{path}: cam0.T_cam_imu", first.T_cam_imu)
+            T[name] = rigid_transform(f"{path}: {name}.T_cam_imu", cam.T_cam_imu) @ se3.inverse(T_cam0_imu)
         else:
             raise UserError(f"{path}: {name}.T_cn_cnm1: is missing: nothing states where the camera sits")
     return T
@@ -168,12 +167,5 @@ def _camera(path: Path, name: str, cam: _Cam) -> ChainCamera:
     # Kalibr's shift is that of row 0, which is read last where rows are read upwards.
     shift = cam.timeshift_cam_imu
     first = None if shift is None else shift + min(delay, 0.0) * (camera.height - 1)
-    T = None if cam.T_cam_imu is None else _rigid(path, f"{name}.T_cam_imu", cam.T_cam_imu)
+    T = None if cam.T_cam_imu is None else rigid_transform(f"{path}: {name}.T_cam_imu", cam.T_cam_imu)
     return ChainCamera(camera, Shutter(abs(delay) * camera.height, 0.0, scan), cam.line_delay is not None, T, first)
-
-
-def _rigid(path: Path, name: str, value: Any) -> FloatArray:
-    try:
-        return se3.orthonormalise(rigid(value, _RIGID))
-    except ValueError as error:
-        raise UserError(f"{path}: {name}: {error}") from None

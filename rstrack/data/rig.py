@@ -12,9 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import Float32Array, FloatArray
+from rsgen.errors import UserError
+from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.limits import rigid
 
+_ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
 _LENS = "focal", "aspect", "cx", "cy", "k1"
 CALIBRATION_NAMES = (
     *(f"depth.{name}" for name in _LENS), *(f"color.{name}" for name in _LENS),
@@ -139,6 +143,14 @@ class Rig:
     def is_registered(self) -> bool:
         """Whether depth images have been warped into the colour camera."""
         return self.depth_camera == self.color_camera and bool((self.T_color_depth == np.eye(4)).all())
+
+
+def rigid_transform(where: str, value: Any) -> FloatArray:
+    """T (4, 4) of a file, its rotation made orthonormal to the last digit. Raises UserError naming `where`."""
+    try:
+        return se3.orthonormalise(rigid(value, _ROTATION_TOLERANCE))
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from None
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,10 @@ from rsgen.array_types import ByteArray
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png, png_fault
-from rsgen.inputs import MOST_PIXELS, image_size
+from rsgen.inputs import image_size
+from rstrack.data.image_files import PNG_START, decoded, image_fault
 from rstrack.formats.recording import FLOAT_DEPTH_SCALE
 
-PNG_START = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 # Bytes of `compressed_depth_image_transport` before the PNG: format, and two floats of the quantisation of 32FC1.
 _DEPTH_HEADER = struct.Struct("<iff")
 _CHANNELS = {
@@ -74,11 +73,8 @@ def units_of_metres(z: npt.NDArray[Any]) -> npt.NDArray[np.uint16]:
 
 def compressed_color(where: str, data: bytes, camera: Camera) -> tuple[bytes, str]:
     """The PNG or JPEG of the camera's size as it is, and its ending. Raises UserError."""
-    if data.startswith(PNG_START):
-        if fault := png_fault(data):
-            raise UserError(f"{where}: the PNG is not whole ({fault})")
-    elif not data.startswith(_JPEG_START) or _JPEG_END not in data[-64:]:
-        raise UserError(f"{where}: is neither a whole PNG nor a whole JPEG")
+    if fault := image_fault(data):
+        raise UserError(f"{where}: is not a whole image ({fault})")
     check_size(where, header_size(where, data), camera)
     return data, "png" if data.startswith(PNG_START) else "jpg"
 
@@ -113,14 +109,9 @@ def compressed_depth(where: str, data: bytes, encoding: str, camera: Camera) -> 
 
 def decode(where: str, data: bytes) -> npt.NDArray[Any]:
     """An image as OpenCV has it. Raises UserError."""
-    width, height = header_size(where, data)
-    if width * height > MOST_PIXELS:
-        raise UserError(f"{where}: claims {width}x{height} pixels: it is damaged")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None:
+    if fault := image_fault(data):
+        raise UserError(f"{where}: is not a whole image ({fault})")
+    if (image := decoded(data)) is None:
         raise UserError(f"{where}: the image cannot be decoded")
     return image
 

@@ -25,6 +25,7 @@ from rsgen.files import parse_yaml, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.limits import rigid
 from rstrack.data.kalibr_camera_file import is_camchain, read_camchain
+from rstrack.data.rig import rigid_transform
 
 
 @dataclass(frozen=True)
@@ -250,12 +251,7 @@ def _noise(path: Path, yaml: _ImuYaml) -> ImuNoise | None:
 
 
 def _rigid(path: Path, name: str, value: Any) -> FloatArray | None:
-    if value is None:
-        return None
-    try:
-        return se3.orthonormalise(rigid(value, _RIGID))
-    except ValueError as error:
-        raise UserError(f"{path}: {name}: {error}") from None
+    return None if value is None else rigid_transform(f"{path}: {name}", value)
 
 
 def _invertible(path: Path, name: str, value: Matrix3 | None) -> FloatArray | None:
