@@ -24,40 +24,17 @@ from rsgen.produce.records import color_truth
 
 # No field takes any of these.
 NEVER: tuple[Any, ...] = (
-    "no such\tthing\n\x07",
-    float("nan"),
-    float("inf"),
-    1e300,
-    -1e300,
-    {"x": 1},
-    [{}],
-    b"\x00\xff",
-)
+    "no such\tthing\n\x07", float("nan"), float("inf"), 1e300, -1e300, {"x": 1}, [{}], b"\x00\xff",
+)  # fmt: skip
 # Some fields take some of these.
 EXTREME: tuple[Any, ...] = (
-    -1,
-    0,
-    5e-324,
-    2**70,
-    True,
-    None,
-    [],
-    [0],
-    "",
-    "~",
-    [[[1]]],
-    "2001-13-45",
-    -(10**400),
-)
+    -1, 0, 5e-324, 2**70, True, None, [], [0], "", "~", [[[1]]], "2001-13-45", -(10**400),
+)  # fmt: skip
 
 TRUTH = {
-    "sharp": True,
-    "global_shutter": ["middle"],
-    "flow": ["global", "next"],
-    "normals": True,
-    "blur_length": True,
+    "sharp": True, "global_shutter": ["middle"], "flow": ["global", "next"], "normals": True, "blur_length": True,
     "color_depth": True,
-}
+}  # fmt: skip
 _POSE = np.eye(4).tolist()
 _SAID = {"intrinsics": [36.0, 36.0, 23.5, 17.5], "model": "fisheye", "distortion": [0.0, 0.0, 0.0, 0.0]}
 _SAID |= {"readout_s": 0.01, "exposure_s": 0.002, "scan": "bottom-top"}

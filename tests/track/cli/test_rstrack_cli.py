@@ -204,19 +204,3 @@ def test_info_says_what_would_be_tracked(place: Path, capfd: pytest.CaptureFixtu
         assert part in out, part
     distance = 1e3 * np.linalg.norm(synthetic.T_COLOR_DEPTH[:3, 3])
     assert f"{distance:.1f} mm" in out
-
-
-# --- folders that hold no run ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("content", ["", "garbage\n", "0 1 2\n" * 5, "\x00\xff" * 50, "nan 0 0 0 0 0 0 1\n" * 5])
-def test_garbage_is_no_run(content: str, place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    Path("run/trajectory.txt").write_bytes(content.encode("latin-1"))
-    refused(capfd, "evaluate seq run", "run/trajectory.txt")
-    refused(capfd, "plot seq run/trajectory.txt --out p.png", "run/trajectory.txt")
-    assert not Path("p.png").exists()
-
-
-def test_a_broken_run_json_is_named(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    Path("run/run.json").write_text("{")
-    refused(capfd, "evaluate seq run", "run.json", "JSON")

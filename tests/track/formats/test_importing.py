@@ -23,13 +23,6 @@ from rstrack.cli.info import describe
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.own_intrinsics import SharedImages
 
-
-@pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 # --- others ----------------------------------------------------------------------------------------------------------
 
 

@@ -16,12 +16,6 @@ from recordings import COLOR, COLOR_K, COLOR_SIZE, COUNT, DEPTH, FRAME, T_COLOR_
 from rsgen.geometry import se3
 
 
-@pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.mark.parametrize(
     ("name", "is_ros1", "storage"),
     [

@@ -15,13 +15,6 @@ from recordings import COLOR, COLOR_SIZE, COUNT, DEPTH, FRAME, Talker
 
 from rsgen.image_codecs import encode_png
 
-
-@pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 Maker = Callable[[Talker, int, int], tuple[str, Any]]
 
 
