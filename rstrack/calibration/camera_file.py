@@ -16,7 +16,7 @@ from rstrack.calibration.parameters import (
     DEPTH_LENS,
     DRIFT,
     EXTRINSICS,
-    SHOWN,
+    UNKNOWNS,
 )
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def camera_file_of(calibration: CameraCalibration) -> str:
     if error.any():
         names = zip(DEPTH, error, beside[DEPTH_ERROR], strict=True)
         depth += ["  error:", *(f"    {name}: {value:.7g}{comment}" for name, value, comment in names)]
-    axes = ", ".join(f"{SHOWN[i][0].split(', ')[1]}{beside[i][3:]}" for i in range(COUNT)[EXTRINSICS])
+    axes = ", ".join(f"{UNKNOWNS[i].label.split(', ')[1]}{beside[i][3:]}" for i in range(COUNT)[EXTRINSICS])
     poses = ["T_color_depth:" + (f"  # {axes}" if calibration.asked[EXTRINSICS].any() else "")]
     poses += ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]
     sigmas = ", ".join(f"{name}: {sigma:.3g}" for name, sigma in calibration.stated_sigmas().items())
@@ -65,10 +65,10 @@ def camera_file_of(calibration: CameraCalibration) -> str:
 def _beside(calibration: CameraCalibration) -> list[str]:
     """For each of the unknowns the comment beside its value."""
     sigmas, comments = calibration.absolute_sigmas, []
-    for (_, unit, factor), sigma, asked, undetermined in zip(
-        SHOWN, sigmas, calibration.asked, calibration.undetermined, strict=True
+    for unknown, sigma, asked, undetermined in zip(
+        UNKNOWNS, sigmas, calibration.asked, calibration.undetermined, strict=True
     ):
-        comment = f"  # ± {2.0 * factor * sigma:.3g} {unit}" if asked else ""
+        comment = f"  # ± {2.0 * unknown.factor * sigma:.3g} {unknown.unit}" if asked else ""
         comments.append("  # undetermined, kept" if undetermined else comment)
     return comments
 

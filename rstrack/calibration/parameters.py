@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
@@ -22,21 +22,67 @@ GROUPS: tuple[str, ...] = get_args(Group)
 
 LENS = "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"
 DEPTH = "offset_m", "inverse_offset", "radial"
-_POSES = (
-    "depth.readout_s", "color.readout_s", "color.offset_s", "color.drift",
-    "T_color_depth.x", "T_color_depth.y", "T_color_depth.z",
-    "T_color_depth.rx", "T_color_depth.ry", "T_color_depth.rz",
-)  # fmt: skip
-NAMES = (
-    *_POSES, *(f"{camera}.{name}" for camera in ("depth", "color") for name in LENS),
-    *(f"depth.error.{name}" for name in DEPTH),
-)  # fmt: skip
-"""The unknowns, in the order of their vectors.
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One of the unknowns. prior: σ that holds it while it is looked for, where nothing is known of it. useful: σ above
+    which it is called undetermined and keeps what it was. label, unit, factor: how the screen shows it. needs: what a
+    recording needs to determine it. typical: σ of what camera files state."""
+
+    name: str
+    group: Group
+    prior: float
+    useful: float
+    label: str
+    unit: str
+    factor: float
+    needs: str
+    typical: float = np.inf
+
+
+def _unknowns() -> Iterator[Unknown]:
+    shapes, texture = "surfaces that lie at many angles", "texture"
+    shaking, changing = "turning and shaking in front of", "motion that changes"
+    yield Unknown("depth.readout_s", "readout", 0.03, 2e-3, "depth readout", "ms", 1e3, f"{shaking} {shapes}")
+    yield Unknown("color.readout_s", "readout", 0.03, 2e-3, "colour readout", "ms", 1e3, f"{shaking} {texture}")
+    yield Unknown("color.offset_s", "offset", 0.05, 2e-3, "colour offset", "ms", 1e3, changing)
+    yield Unknown("color.drift", "offset", 5e-3, 5e-5, "colour drift", "ppm", 1e6, f"some ten seconds of {changing}")
+    # A lens can make up for where the colour camera sits.
+    group: Group = "extrinsics"
+    label, turning, degree = "colour from depth,", "turning about two axes", float(np.radians(1.0))
+    for axis in "xyz":
+        needs = f"{turning} in front of near and far texture"
+        yield Unknown(f"T_color_depth.{axis}", group, 0.05, 5e-3, f"{label} {axis}", "mm", 1e3, needs, 0.01)
+    for axis in "xyz":
+        name, sigmas = f"T_color_depth.r{axis}", (float(np.radians(5.0)), float(np.radians(0.3)))
+        yield Unknown(name, group, *sigmas, f"{label} about {axis}", "deg", float(np.degrees(1.0)), turning, degree)
+    # A principal point that is stated as the middle is off by 8 of 525 px (σ), and elements are centred, so that
+    # tangential distortion stays small. A recording that hardly turns about some axis does not separate a principal
+    # point from tangential distortion and a turn; what lenses are like then does.
+    typical = 0.03, 0.03, 0.015, 0.015, 0.2, 0.5, 3e-3, 3e-3, 1.0
+    useful = 0.01, 0.01, 0.01, 0.01, 0.05, 0.2, 5e-3, 5e-3, 0.5
+    for camera, shown, seen in (("depth", "depth", "shapes"), ("color", "colour", texture)):
+        needs = f"turning about all axes, so that all of the image sees {seen}"
+        for name, sigma, least in zip(LENS, typical, useful, strict=True):
+            unit, factor = ("px", 1.0) if name[0] in "fc" else ("1e-3", 1e3)
+            label = f"{shown} {name}"
+            yield Unknown(f"{camera}.{name}", "intrinsics", 10.0 * sigma, least, label, unit, factor, needs, sigma)
+    needs = "surfaces near and far, seen from near and far"
+    yield Unknown("depth.error.offset_m", "depth", 0.03, 0.01, "depth offset", "mm", 1e3, needs)
+    yield Unknown("depth.error.inverse_offset", "depth", 0.02, 5e-3, "depth inverse offset", "1/km", 1e3, needs)
+    yield Unknown("depth.error.radial", "depth", 0.02, 5e-3, "depth radial", "1/km", 1e3, needs)
+
+
+UNKNOWNS = tuple(_unknowns())
+"""All unknowns, in the order of their vectors.
 
 Extrinsics: T_color_depth ← exp(ε) T_color_depth, ε in colour's axes. Lenses: fx and fy as parts of what the camera file
 has, cx and cy in its focal lengths, and distortion as OpenCV counts it. Depth: see `DepthError`.
 """
-COUNT, POSES = len(NAMES), len(_POSES)
+NAMES = tuple(unknown.name for unknown in UNKNOWNS)
+PRIOR, USEFUL, _TYPICAL = np.array([(each.prior, each.useful, each.typical) for each in UNKNOWNS]).T
+COUNT, POSES = len(NAMES), NAMES.index("depth.fx")
 DRIFT = NAMES.index("color.drift")
 EXTRINSICS = slice(DRIFT + 1, POSES)
 DEPTH_LENS, COLOR_LENS = slice(POSES, POSES + len(LENS)), slice(POSES + len(LENS), POSES + 2 * len(LENS))
@@ -45,49 +91,8 @@ LENSES = np.isin(np.arange(COUNT), np.r_[DEPTH_LENS, COLOR_LENS])
 BY_COLOR = np.isin(np.arange(COUNT), [NAMES.index("color.readout_s"), *range(COUNT)[COLOR_LENS]])
 """Those (31,) that are seen in colour images."""
 DEPTH_ERROR = slice(POSES + 2 * len(LENS), COUNT)
-
-_SIZES: tuple[tuple[Group, int], ...] = (
-    ("readout", 2), ("offset", 2), ("extrinsics", 6), ("intrinsics", 2 * len(LENS)), ("depth", len(DEPTH)),
-)  # fmt: skip
-_GROUP_OF = tuple(group for group, size in _SIZES for _ in range(size))
-# How far off a camera file's lens usually is (σ): a principal point stated as the middle by 8 of 525 px, and
-# elements are centred, so that tangential distortion stays small. A recording that hardly turns about some axis does
-# not separate a principal point from tangential distortion and a turn; what lenses are like then does.
-LENS_SIGMA = np.array([0.03, 0.03, 0.015, 0.015, 0.2, 0.5, 3e-3, 3e-3, 1.0])
-# And its pixels are as wide as high.
-ASPECT_SIGMA = 3e-3
-# And where the colour camera sits, which a lens can make up for: m, rad.
-EXTRINSICS_SIGMA = np.array([*(0.01,) * 3, *np.radians((1.0,) * 3)])
-# What holds each (σ) that nothing is known of, while it is looked for: s, s, s, s/s, m, rad; of depth: see NAMES.
-PRIOR = np.array([
-    0.03, 0.03, 0.05, 5e-3, *(0.05,) * 3, *np.radians((5.0,) * 3), *(10.0 * LENS_SIGMA), *(10.0 * LENS_SIGMA),
-    0.03, 0.02, 0.02,
-])  # fmt: skip
-# σ above which a value is of no use: it is called undetermined and keeps what it was.
-USEFUL = np.array([
-    2e-3, 2e-3, 2e-3, 5e-5, *(5e-3,) * 3, *np.radians((0.3,) * 3),
-    *(0.01, 0.01, 0.01, 0.01, 0.05, 0.2, 5e-3, 5e-3, 0.5) * 2, 0.01, 5e-3, 5e-3,
-])  # fmt: skip
-SHOWN = (
-    ("depth readout", "ms", 1e3), ("colour readout", "ms", 1e3), ("colour offset", "ms", 1e3),
-    ("colour drift", "ppm", 1e6), *((f"colour from depth, {axis}", "mm", 1e3) for axis in "xyz"),
-    *((f"colour from depth, about {axis}", "deg", float(np.degrees(1.0))) for axis in "xyz"),
-    *(
-        (f"{camera} {name}", *(("px", 1.0) if name[0] in "fc" else ("1e-3", 1e3)))
-        for camera in ("depth", "colour") for name in LENS
-    ),
-    ("depth offset", "mm", 1e3), ("depth inverse offset", "1/km", 1e3), ("depth radial", "1/km", 1e3),
-)  # fmt: skip
-"""Name on the screen, unit and factor of each unknown."""
-NEEDS = (
-    "turning and shaking in front of surfaces that lie at many angles", "turning and shaking in front of texture",
-    "motion that changes", "some ten seconds of motion that changes",
-    *(("turning about two axes in front of near and far texture",) * 3), *(("turning about two axes",) * 3),
-    *(("turning about all axes, so that all of the image sees shapes",) * len(LENS)),
-    *(("turning about all axes, so that all of the image sees texture",) * len(LENS)),
-    *(("surfaces near and far, seen from near and far",) * 3),
-)  # fmt: skip
-"""What a recording needs to determine it."""
+# σ of fy over fx: a camera's pixels are as wide as high.
+_ASPECT_SIGMA = 3e-3
 # How far, in σ, the estimate of a recording may lie from what was known before it is taken to contradict it.
 _CONTRADICTS = 3.0
 # The part of what was known by which a solution has to move at least, over that many σ, to count as moved.
@@ -168,7 +173,7 @@ def changed(camera: Camera, lens: FloatArray) -> Camera:
 
 def free_of(groups: Sequence[str]) -> BoolArray:
     """Which of the unknowns (31,) belong to the groups."""
-    return np.array([group in groups for group in _GROUP_OF])
+    return np.array([unknown.group in groups for unknown in UNKNOWNS])
 
 
 @dataclass(frozen=True)
@@ -198,10 +203,8 @@ class Known:
 
     def with_lenses(self) -> Known:
         """With what lenses are like and where two cameras sit, where nothing else is known of them."""
-        usual = np.full(COUNT, np.inf)
-        usual[DEPTH_LENS] = usual[COLOR_LENS] = LENS_SIGMA
-        usual[EXTRINSICS] = EXTRINSICS_SIGMA
-        return replace(self, sigmas=np.where(np.isfinite(self.sigmas), self.sigmas, usual), aspect=ASPECT_SIGMA)
+        sigmas = np.where(np.isfinite(self.sigmas), self.sigmas, _TYPICAL)
+        return replace(self, sigmas=sigmas, aspect=_ASPECT_SIGMA)
 
     def contradicted(self, found: Parameters, sigmas: FloatArray) -> BoolArray:
         """Which (31,) of the known values a recording contradicts, by what was found with them and its σ (10,).

@@ -31,8 +31,7 @@ from rstrack.calibration.parameters import (
     EXTRINSICS,
     LENS,
     NAMES,
-    NEEDS,
-    SHOWN,
+    UNKNOWNS,
     USEFUL,
     Parameters,
     changed,
@@ -105,14 +104,14 @@ class CameraCalibration:
         """A table of the values with their σ, what could not be determined and why, and notes."""
         sigmas, absolute, before = self.absolute_sigmas, self._absolute(self.values), self._absolute(self.start)
         lines = [f"{'':<28}{'found':>10}   {'2 sigma':>9}   {'from':>10}"]
-        for i, (name, unit, factor) in enumerate(SHOWN):
-            if not self.asked[i]:
-                continue
+        for i in np.flatnonzero(self.asked):
+            unknown, factor = UNKNOWNS[i], UNKNOWNS[i].factor
+            line = f"{unknown.label:<28}{factor * absolute[i]:>10.3f}"
             if self.undetermined[i]:
-                lines.append(f"{name:<28}{factor * absolute[i]:>10.3f}   undetermined: needs {NEEDS[i]}")
+                lines.append(f"{line}   undetermined: needs {unknown.needs}")
             else:
-                found = f"{factor * absolute[i]:>10.3f} ± {2.0 * factor * sigmas[i]:>9.3f}"
-                lines.append(f"{name:<28}{found}   {factor * before[i]:>10.3f} {unit}")
+                found = f" ± {2.0 * factor * sigmas[i]:>9.3f}   {factor * before[i]:>10.3f} {unknown.unit}"
+                lines.append(line + found)
         if self.undetermined.any():
             lines.append(self.motion.text())
         lines += [f"{name} lens: {text}" for name, text in self._lenses_px().items()]
@@ -156,10 +155,10 @@ class CameraCalibration:
                     "sigma": None if np.isnan(sigmas[i]) else float(sigmas[i]),
                     "state": "undetermined" if self.undetermined[i] else "found",
                     "told_by_stretch": np.round(shares[:, i], 4).tolist(),
-                    "shown": dict(zip(("label", "unit", "factor"), SHOWN[i], strict=True)),
-                    "useful_sigma": float(useful[i]), "needs": NEEDS[i],
+                    "shown": {"label": unknown.label, "unit": unknown.unit, "factor": unknown.factor},
+                    "useful_sigma": float(useful[i]), "needs": unknown.needs,
                 }
-                for i, name in enumerate(NAMES) if self.asked[i]
+                for i, (name, unknown) in enumerate(zip(NAMES, UNKNOWNS, strict=True)) if self.asked[i]
             },
             "T_color_depth": self.values.T_color_depth.tolist(),
             "stretches": [[part.start, part.stop] for part in self.parts],
