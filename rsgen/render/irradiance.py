@@ -57,7 +57,7 @@ def registry_id(shape: Any) -> int:
 
 
 def make_lattice(scene: Any, spacing: float) -> Lattice:
-    """Lattice over all meshes of `scene` with about `spacing` metres between samples, more on land that is far.
+    """Lattice over all meshes of `scene` with about `spacing` metres between samples, more on terrain that is far.
 
     Raises UserError, before it takes the memory, if baking so many samples would need more than 4 GB.
     """
