@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
@@ -22,8 +23,21 @@ MAX_DURATION_S = 3600.0
 MAX_STROKES_HZ = 4.0
 """Ways there or back a second, at most: two whole swings, ten 50 ms knots each."""
 
+Fields = Mapping[str, tuple[str, ...]]
+"""Names of fields by kind of motion."""
+
 _NEEDED = {"line": ("position", "target"), "roll": ("position", "target"), "tour": ("waypoints",)}
 _OPTIONAL = {"line": ("strokes", "sway", "sway_hz"), "roll": ("strokes",), "tour": ("closed", "sway", "sway_hz")}
+
+
+def _check_kind(section: Section, kind: str, needs: Fields, takes: Fields) -> None:
+    """Raises ValueError if a field that this kind of motion needs is missing, or one of another kind is set."""
+    if missing := [name for name in needs[kind] if not getattr(section, name)]:
+        raise ValueError(f"kind {kind} needs {' and '.join(missing)}")
+    others = {name for k in needs for name in (*needs[k], *takes[k])} - {*needs[kind], *takes[kind]}
+    fields = type(section).model_fields  # a default that is written out, as in sequence.yaml, does not count
+    if foreign := sorted(name for name in others if getattr(section, name) != fields[name].default):
+        raise ValueError(f"{', '.join(foreign)}: not for kind {kind}: remove")
 
 
 class Waypoint(Section):
@@ -105,14 +119,7 @@ class MotionConfig(Section):
 
     @model_validator(mode="after")
     def _is_complete(self) -> MotionConfig:
-        mine = {*_NEEDED[self.kind], *_OPTIONAL[self.kind]}
-        missing = [name for name in _NEEDED[self.kind] if not getattr(self, name)]
-        if missing:
-            raise ValueError(f"kind {self.kind} needs {' and '.join(missing)}")
-        others = {name for kind in _NEEDED for name in (*_NEEDED[kind], *_OPTIONAL[kind])} - mine
-        fields = type(self).model_fields  # a default that is written out, as in sequence.yaml, does not count
-        if foreign := sorted(name for name in others if getattr(self, name) != fields[name].default):
-            raise ValueError(f"{', '.join(foreign)}: not for kind {self.kind}: remove")
+        _check_kind(self, self.kind, _NEEDED, _OPTIONAL)
         fewest = 3 if self.closed else 2
         if self.kind == "tour" and len(self.waypoints) < fewest:
             raise ValueError(f"a {'closed' if self.closed else 'open'} tour needs at least {fewest} waypoints")
@@ -216,13 +223,7 @@ class ObjectMotionConfig(Section):
 
     @model_validator(mode="after")
     def _has_what_its_kind_needs(self) -> ObjectMotionConfig:
-        needed = _OBJECT_NEEDS[self.kind]
-        if missing := [name for name in needed if getattr(self, name) in (None, ())]:
-            raise ValueError(f"kind {self.kind} needs {' and '.join(missing)}")
-        mine = {*needed, *_OBJECT_TAKES[self.kind], "kind", "knot_spacing_s"}
-        fields = type(self).model_fields
-        if foreign := sorted(n for n in fields.keys() - mine if getattr(self, n) != fields[n].default):
-            raise ValueError(f"{', '.join(foreign)}: not for kind {self.kind}: remove")
+        _check_kind(self, self.kind, _OBJECT_NEEDS, _OBJECT_TAKES)
         if self.kind == "waypoints" and len(self.waypoints) < 2:
             raise ValueError("waypoints: give two at least")
         times = [w.time_s for w in self.waypoints]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from rsgen.check.reprojection import RelativeMotion
 from rsgen.config.config import Config, load_config
+from rsgen.config.faults import from_recorded
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 
@@ -51,7 +52,9 @@ def test_a_config_without_things_is_what_it_was(tmp_path: Path) -> None:
     with_it, without = load_config(path), load_config(path, {"objects": "[]"})
     assert "objects" not in without.content()
     assert with_it.content()["objects"] == [{"name": "thing", "shape": BOX, "motion": CIRCLE}]
-    again = Config.model_validate(with_it.content() | {"trajectory": {"file": "a"}, "scene": {"file": "b"}})
+    again = Config.model_validate(
+        from_recorded(with_it.content()) | {"trajectory": {"file": "a"}, "scene": {"file": "b"}}
+    )
     assert again.objects == with_it.objects
 
 

@@ -104,7 +104,7 @@ def digest(image: np.ndarray) -> str:
 
 _OTHER_PROCESS = """
 import sys
-sys.path[:0] = sys.argv[1], sys.argv[1] + "/../gen"
+sys.path[:0] = sys.argv[1], sys.argv[1] + "/../gen/render"
 from pathlib import Path
 import test_render_images as t
 scene = t.load_scene(Path(sys.argv[2]))
