@@ -51,7 +51,7 @@ def closed(graph: Graph, loops: Sequence[Loop], begin: float, progress: Progress
 
     A loop that contradicts the others and the track is left out. Where that were more than a few, though they go with
     each other, it is the track that is wrong by more than estimated: with a slightly wrong camera file, frame after
-    frame errs alike, and one blurred stretch may bend all that follows, which no single frame shows. Raises
+    frame errs alike, and one blurred part may bend all that follows, which no single frame shows. Raises
     numpy.linalg.LinAlgError where the system has no solution.
     """
     found = _closed(graph, loops, 1.0, progress)

@@ -242,12 +242,12 @@ class LoopSearch:
 
     def _covariance(self, found: Alignment) -> FloatArray:
         turn = _SYSTEMATIC_PX / self.rig.depth_camera.fx
-        systematic = np.diag(np.repeat([turn * self.usual_depth, turn], 3) ** 2)
+        systematic = np.diag(np.repeat([turn * self.median_depth, turn], 3) ** 2)
         # Directions that the images leave open get a large, finite one.
         return np.asarray(np.linalg.inv(found.information + np.diag(np.repeat([1.0, 1.0], 3))) + systematic)
 
     @cached_property
-    def usual_depth(self) -> float:
+    def median_depth(self) -> float:
         """Median distance (m) of what the keyframes see."""
         return float(np.median([self.archive.small(k).median_depth for k in self.archive.indices]))
 

@@ -50,7 +50,7 @@ class Inertia:
         self._walk = np.repeat([recording.noise.gyro_walk, recording.noise.accel_walk, _DRIFT, 0.0], 3) ** 2
         self._band, self._dt = MotionBand.of(recording), 0.0
         self.common = self._band.allowed if self.is_informative else ACCELERATION
-        self.sigma, self._told = self._noise, np.zeros(2)
+        self.sigma, self._sampled = self._noise, np.zeros(2)
         self._smoother: Smoother | None = None
         self._until, self._next, self._tripled = -np.inf, -np.inf, 0
         self.estimate = ImuEstimate.initial(np.array([0.0, recording.gravity, 0.0]))
@@ -94,7 +94,7 @@ class Inertia:
     def begin_segment(self) -> None:
         """The spline goes on elsewhere, with control points that have nothing to do with those before."""
         if self._smoother is not None:
-            self._smoother.forget(self._smoother.last)
+            self._smoother.marginalise(self._smoother.last)
         self._until = self._next = -np.inf
 
     def shift(self, covariance: FloatArray) -> None:
@@ -218,7 +218,7 @@ class Inertia:
             smoother.add(joint)
             smoother.diffuse(self._walk * max(1e-6, float(self._until - begin)))
         keep = state.segment(self._until) if joint is not None else smoother.first
-        smoother.forget(max(keep, state.first))
+        smoother.marginalise(max(keep, state.first))
         before = self.estimate.mean
         self._update(smoother)
         if joint is not None and self.is_informative:
@@ -279,14 +279,14 @@ class Inertia:
         """
         if dt != self._dt:
             self._dt, self.sigma = dt, np.hypot(self._noise, self._band.scatter(dt))
-            self._told = np.full(2, _EXPECTED)
+            self._sampled = np.full(2, _EXPECTED)
 
     def _learn_sigma(self, r: FloatArray, counts: FloatArray, dt: float) -> None:
         # Of noise a spline follows a part; what it cannot follow is all in the residuals.
         followed = min(1.0, 1.0 / (self.recording.rate_hz * dt)) * self._noise**2
         squares, number = (each.reshape(-1, 2, 3).sum(axis=(0, 2)) for each in (r**2 * counts, counts))
-        self._told = np.minimum(self._told + number / 3.0, _MEMORY)
-        weight = np.minimum(1.0, number / (3.0 * self._told))
+        self._sampled = np.minimum(self._sampled + number / 3.0, _MEMORY)
+        weight = np.minimum(1.0, number / (3.0 * self._sampled))
         seen = squares / np.maximum(1.0, number) + followed
         seen = np.minimum(seen, 25.0 * self.sigma**2)  # one blow must not blind it for long
         mean = np.where(number > 0.0, (1.0 - weight) * self.sigma**2 + weight * seen, self.sigma**2)

@@ -133,7 +133,7 @@ class Smoother:
         H = self.H - rows.T @ gains
         self.H = 0.5 * (H + H.T)
 
-    def forget(self, first: int) -> None:
+    def marginalise(self, first: int) -> None:
         """Marginalise the control points before number `first`."""
         count = 6 * min(max(0, first - self.first), len(self.at))
         if not count:
@@ -147,12 +147,12 @@ class Smoother:
     def marginal(self) -> ImuEstimate:
         """The estimate."""
         only = Smoother(self.first, self.H, self.g, self.at, self.estimate)
-        only.forget(self.last)
+        only.marginalise(self.last)
         return ImuEstimate(self.estimate - np.linalg.solve(only.H, only.g), only.H)
 
 
 class ReusedPrior:
-    """A `rstrack.alignment.priors.Prior` of an IMU, around a state.
+    """A `rstrack.alignment.priors.Prior` whose normal equations are used again while the spline hardly moves.
 
     summed: its model around the state as it is now, and the cost there. first, end: the control points that it depends
     on, and how many there were of all.

@@ -156,7 +156,7 @@ def test_an_imus_description_is_for_runs_that_use_one(run: Path, tmp_path: Path)
     ("change", "complaint"),
     [
         (lambda run: (run / "spline.npz").unlink(), "has no spline"),
-        (lambda run: (run / "run.json").write_text("{}"), "does not say where its sequence is"),
+        (lambda run: (run / "run.json").write_text("{}"), "where its sequence is"),
         (
             lambda run: (run / "run.json").write_text(
                 json.dumps(json.loads((run / "run.json").read_text()) | {"options": {"method": "magic"}})

@@ -119,7 +119,7 @@ def test_marginalising_leaves_the_rest_as_it_was() -> None:
     smoother = filled()
     covariance, mean = np.linalg.inv(smoother.H), -np.linalg.solve(smoother.H, smoother.g)
     for first in (2, 3, 5):
-        smoother.forget(first)
+        smoother.marginalise(first)
         rest = slice(6 * first, None)
         np.testing.assert_allclose(np.linalg.inv(smoother.H), covariance[rest, rest], atol=1e-9)
         np.testing.assert_allclose(-np.linalg.solve(smoother.H, smoother.g), mean[rest], atol=1e-9)
