@@ -215,7 +215,7 @@ def export(
 ) -> int:
     """Write a sequence in the layout of other tools."""
     from rsgen.console.progress import ProgressDisplay
-    from rsgen.formats.export.folder import ExportOptions
+    from rsgen.formats.export.shared import ExportOptions
     from rsgen.sequence.reader import read_sequence
 
     options = ExportOptions(to, copy, scene, storage)

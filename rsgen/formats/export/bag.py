@@ -16,7 +16,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import write_error
-from rsgen.formats.export.folder import ExportOptions, new_file
+from rsgen.formats.export.shared import ExportOptions, new_file
 from rsgen.geometry.camera import Camera
 
 _SUFFIXES: dict[str, tuple[str, ...]] = {"ros1": (".bag",), "ros2": (), "mcap": (".mcap",)}

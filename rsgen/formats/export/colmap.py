@@ -16,7 +16,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.formats.export import poses
-from rsgen.formats.export.folder import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
+from rsgen.formats.export.shared import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import pose_rows

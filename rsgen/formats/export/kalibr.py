@@ -14,7 +14,7 @@ from rsgen.config.imu import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.formats.export.folder import (
+from rsgen.formats.export.shared import (
     DEFAULTS,
     EPOCH_S,
     ExportOptions,

@@ -21,7 +21,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes, write_error
 from rsgen.formats.export import poses
-from rsgen.formats.export.folder import DEFAULTS, EPOCH_S, ExportOptions, image_streams, new_folder
+from rsgen.formats.export.shared import DEFAULTS, EPOCH_S, ExportOptions, image_streams, new_folder
 from rsgen.geometry import se3
 from rsgen.sequence.reader import ImageStream, Sequence
 

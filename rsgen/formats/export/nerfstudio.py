@@ -24,7 +24,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.formats.export import poses
-from rsgen.formats.export.folder import (
+from rsgen.formats.export.shared import (
     DEFAULTS,
     ExportOptions,
     aligned_depth,

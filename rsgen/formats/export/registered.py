@@ -12,7 +12,7 @@ from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.formats.export.folder import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
+from rsgen.formats.export.shared import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth

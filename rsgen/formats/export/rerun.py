@@ -16,7 +16,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.console.rerun import recording_file
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
-from rsgen.formats.export.folder import DEFAULTS, ExportOptions, image_streams
+from rsgen.formats.export.shared import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.reader import ImageStream, Sequence

@@ -25,8 +25,8 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.formats.export.bag import TF, Bag, new_bag
-from rsgen.formats.export.folder import ExportOptions, image_streams
 from rsgen.formats.export.poses import Loss, between, loss_of_poses, loss_words, observations, shutter_facts
+from rsgen.formats.export.shared import ExportOptions, image_streams
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds

@@ -12,7 +12,7 @@ from rsgen.array_types import ByteArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import whole_file
-from rsgen.formats.export.folder import DEFAULTS, ExportOptions, new_file
+from rsgen.formats.export.shared import DEFAULTS, ExportOptions, new_file
 from rsgen.sequence.reader import Sequence
 
 # Encoders that OpenCV's own wheels bring along.

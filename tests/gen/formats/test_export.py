@@ -19,11 +19,11 @@ from rsgen import formats
 from rsgen.config.config import Config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
-from rsgen.formats.export import folder
+from rsgen.formats.export import shared
 from rsgen.formats.export.euroc import export_euroc
-from rsgen.formats.export.folder import place_images
 from rsgen.formats.export.kalibr import export_kalibr
 from rsgen.formats.export.registered import export_registered
+from rsgen.formats.export.shared import place_images
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import exact_imu
@@ -49,7 +49,7 @@ def test_images_are_copied_where_links_cannot_be(
     def no_link(*_: object) -> None:
         raise OSError(18, "Invalid cross-device link")
 
-    monkeypatch.setattr(folder.os, "link", no_link)
+    monkeypatch.setattr(shared.os, "link", no_link)
     source = plain.streams["color"].paths[0]
     place_images([source], [tmp_path / "a.png"], False, no_progress)
     assert (tmp_path / "a.png").read_bytes() == source.read_bytes()

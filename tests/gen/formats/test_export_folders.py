@@ -15,9 +15,9 @@ from shutter_reference import line_window
 
 from rsgen.errors import UserError
 from rsgen.formats.export.euroc import export_euroc
-from rsgen.formats.export.folder import ExportOptions
 from rsgen.formats.export.kalibr import export_kalibr, row_clock
 from rsgen.formats.export.registered import export_registered
+from rsgen.formats.export.shared import ExportOptions
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter

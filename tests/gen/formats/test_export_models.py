@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
 from rsgen.formats.export.colmap import camera_line, export_colmap
-from rsgen.formats.export.folder import NO_DEPTH, ExportOptions
 from rsgen.formats.export.nerfstudio import export_nerfstudio, ngp_rolling_shutter
 from rsgen.formats.export.poses import Loss, observations
+from rsgen.formats.export.shared import NO_DEPTH, ExportOptions
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter

@@ -12,9 +12,9 @@ import synthetic
 
 from rsgen.errors import UserError
 from rsgen.formats.export import poses
-from rsgen.formats.export.folder import EPOCH_S
 from rsgen.formats.export.ncore import ENDS, export_ncore, frame_times_us
 from rsgen.formats.export.poses import Observations, observations
+from rsgen.formats.export.shared import EPOCH_S
 from rsgen.sequence.reader import Sequence, read_sequence
 
 LENSES: dict[str, list[float]] = {

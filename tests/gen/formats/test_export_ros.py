@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
 from rsgen.formats.export import bag
-from rsgen.formats.export.folder import ExportOptions, Storage
 from rsgen.formats.export.ros import export_ros, loss_of_tf
+from rsgen.formats.export.shared import ExportOptions, Storage
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
