@@ -182,24 +182,17 @@ def test_being_around_another_state_costs_what_the_quadratic_says() -> None:
 
 
 def learnt(
-    seed: int, seconds: float, every: float = 1 / 30, turn: FloatArray | None = None
-) -> tuple[Inertia, Spline]:  # fmt: skip
-    """A unit beside poses with noise, as the tracker would tell it of them."""
-    truth = hand_held(seconds, seed)
+    truth: Spline, seed: int, end: float = np.inf, *, every: float = 1 / 30, turn: FloatArray | None = None,
+    wall: float = np.inf,
+) -> Inertia:  # fmt: skip
+    """An IMU beside poses with noise until a time, s, as the tracker would give it them; a way along x is open from the
+    time `wall` on."""
     inertia, state = Inertia(recording(truth, seed, turn=turn)), SplineState(truth)
     for t, T in seen_poses(truth, np.random.default_rng(seed), every):
-        model, _ = pose_constraint(state.spline, t, T, POSE_SIGMA)
-        inertia.learn(state, 0, [model], t + 0.015 if t + 0.015 < truth.t_end else t)
-    return inertia, truth
-
-
-def learnt_until(truth: Spline, seed: int, end: float, wall: float = np.inf) -> Inertia:
-    """The same of a motion until a time, s; a way along x is open from a time on."""
-    inertia, state = Inertia(recording(truth, seed)), SplineState(truth)
-    for t, T in seen_poses(truth, np.random.default_rng(seed)):
         if t < end:
             sigma = POSE_SIGMA * [1.0 if t < wall else 1e3, 1.0, 1.0, 1.0, 1.0, 1.0]
-            inertia.learn(state, 0, [pose_constraint(state.spline, t, T, sigma)[0]], t + 0.015)
+            model, _ = pose_constraint(state.spline, t, T, sigma)
+            inertia.learn(state, 0, [model], t + 0.015 if t + 0.015 < truth.t_end else t)
     return inertia
 
 
@@ -208,7 +201,7 @@ def test_biases_gravity_and_turn_are_found_to_what_their_sigmas_say() -> None:
     scores = []
     for seed in range(50):
         turn = np.random.default_rng(100 + seed).normal(0.0, TURNED, 3)
-        inertia, _ = learnt(seed, 0.8, 0.1, turn)
+        inertia = learnt(hand_held(0.8, seed), seed, every=0.1, turn=turn)
         off = inertia.estimate.mean - np.concatenate([BIAS, GRAVITY, turn])
         scores.append(off / inertia.estimate.sigmas)
     assert (np.abs(scores) < 3.0).mean() > 0.98
@@ -220,7 +213,7 @@ def test_biases_gravity_and_turn_are_found_to_what_their_sigmas_say() -> None:
 def test_a_place_that_readings_contradict_is_said() -> None:
     """0.3° of turn are found, and said to be; without any nothing is."""
     turn = np.radians([0.2, -0.2, 0.1])
-    (off, _), (right, _) = learnt(3, 2.0, turn=turn), learnt(3, 2.0)
+    off, right = (learnt(hand_held(2.0, 3), 3, turn=given) for given in (turn, None))
     assert is_contradicted(off.estimate) and not is_contradicted(right.estimate)
     assert np.linalg.norm(off.estimate.mean[TURN] - turn) < np.radians(0.1)
     said, plain = (text(record(inertia), 0.0, 0) for inertia in (off, right))
@@ -229,7 +222,8 @@ def test_a_place_that_readings_contradict_is_said() -> None:
 
 
 def test_a_second_look_knows_gravity_and_says_when() -> None:
-    inertia, truth = learnt(3, 5.0, 0.1)
+    truth = hand_held(5.0, 3)
+    inertia = learnt(truth, 3, every=0.1)
     angle = np.degrees(np.arccos(min(1.0, inertia.estimate.direction @ GRAVITY / STRENGTH)))
     assert angle < 0.2 and inertia.estimate.direction_deg < 0.3
     assert 0.1 < inertia.usable_s < 1.0 < inertia.determined_s < 4.5 < truth.t_end
@@ -246,7 +240,7 @@ def ahead_of(inertia: Inertia, state: SplineState) -> tuple[ReusedPrior, FloatAr
 
 def test_what_is_ahead_has_the_derivatives_of_its_cost() -> None:
     truth = hand_held(0.6, 5)
-    inertia = learnt_until(truth, 5, 0.5)
+    inertia = learnt(truth, 5, 0.5)
     for seed in range(3):
         state = SplineState(truth)
         known = inertia.ahead(state)
@@ -266,7 +260,7 @@ def test_what_is_ahead_leads_on_from_where_images_end() -> None:
     """The newest control points, moved away, come back to where the readings have them: no image has seen these."""
     for seed in range(4):
         truth = hand_held(0.7, seed)
-        inertia, state = learnt_until(truth, seed, 0.6), SplineState(truth)
+        inertia, state = learnt(truth, seed, 0.6), SplineState(truth)
         last = state.segment(0.6) + 4
         state.apply(last, np.tile(np.repeat([0.01, 0.02], 3), (state.end - last, 1)))
         for _ in range(4):
@@ -279,24 +273,18 @@ def test_what_is_ahead_leads_on_from_where_images_end() -> None:
         assert (np.abs(off).max(axis=0) < 3.0 * told).all() and (told < np.repeat([1e-3, 6e-4], 3)).all()
 
 
-def test_nothing_is_held_before_the_unit_is_of_use_or_of_another_piece() -> None:
+def test_what_is_held_is_of_a_usable_imu_of_this_segment_where_images_leave_no_way_open() -> None:
     truth = hand_held(0.6, 5)
-    assert learnt_until(truth, 5, 0.04).held(0) is None
-    inertia = learnt_until(truth, 5, 0.5)
+    assert learnt(truth, 5, 0.04).held(0) is None and learnt(truth, 5, 0.5, wall=0.45).held(0) is None
+    inertia = learnt(truth, 5, 0.5, wall=0.51)
     held = inertia.held(0)
     assert held is not None and held > 10 and inertia.held(held + 1) is None
     inertia.begin_segment()
     assert inertia.held(0) is None
 
 
-def test_nothing_is_held_where_images_leave_a_way_open() -> None:
-    truth = hand_held(0.6, 5)
-    assert learnt_until(truth, 5, 0.5, wall=0.45).held(0) is None
-    assert learnt_until(truth, 5, 0.5, wall=0.51).held(0) is not None
-
-
 def test_another_world_has_its_own_gravity_and_the_same_biases() -> None:
-    inertia, _ = learnt(3, 1.2)
+    inertia = learnt(hand_held(1.2, 3), 3)
     own, before = [*range(6), *range(9, 12)], inertia.estimate
     inertia.begin_world()
     np.testing.assert_allclose(inertia.estimate.sigmas[own], before.sigmas[own], rtol=1e-9)
