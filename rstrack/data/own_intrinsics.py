@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
 from rsgen.errors import UserError
@@ -36,44 +37,15 @@ class OwnIntrinsics:
     own: FloatArray
     shared: FloatArray
 
-    def taps(self, k: int, axis: int, size: int) -> Taps | None:
-        """Where the columns (axis 0) or rows (1) of the shared camera lie in image k; None: where they are."""
+    def warp(self, k: int) -> FloatArray | None:
+        """(2, 3) from pixels of the shared camera to those of image k: a scale and a shift; None: they are the same."""
         if (self.own[k] == self.shared).all():
             return None
-        (f_own, c_own), (f, c) = self.own[k, axis::2], self.shared[axis::2]
-        return Taps.at(f_own / f, c_own - f_own / f * c, size)
-
-
-@dataclass(frozen=True)
-class Taps:
-    """Linear interpolation along an axis at scale · pixel + shift.
-
-    first (n,): one neighbour, weight (n,): of the next, inside (n,): whether there is an image.
-    """
-
-    scale: float
-    shift: float
-    first: IntArray
-    weight: Float32Array
-    inside: np.ndarray
-
-    @classmethod
-    def at(cls, scale: float, shift: float, size: int) -> Taps:
-        """Of an image of n pixels, outside of which is its rim."""
-        positions = scale * np.arange(size) + shift
-        held = np.clip(positions, 0.0, size - 1.0)
-        first = np.clip(np.floor(held).astype(np.int64), 0, max(size - 2, 0))
-        return cls(scale, shift, first, (held - first).astype(np.float32), positions == held)
-
-    @property
-    def second(self) -> IntArray:
-        """The other neighbours (n,)."""
-        return self.first + (self.weight > 0)
-
-    @property
-    def nearest(self) -> IntArray:
-        """The nearer one (n,)."""
-        return self.first + (self.weight > 0.5)
+        warp = np.zeros((2, 3))
+        for axis in (0, 1):
+            (f_own, c_own), (f, c) = self.own[k, axis::2], self.shared[axis::2]
+            warp[axis, axis], warp[axis, 2] = f_own / f, c_own - f_own / f * c
+        return warp
 
 
 @dataclass(frozen=True)
@@ -86,15 +58,13 @@ class SharedImages:
 
     def color(self, k: int) -> ByteArray:
         """RGB (h, w, 3) of colour image k, bilinear; beyond its rim as at the rim. Raises UserError."""
-        image = self.images.color(k)
-        taps = _both(self.own_color, k, image.shape)
-        return image if taps is None else _interpolated_color(image, *taps)
+        image, warp = self.images.color(k), None if self.own_color is None else self.own_color.warp(k)
+        return image if warp is None else _interpolated_color(image, warp)
 
     def depth(self, k: int) -> Float32Array:
         """Planar z (h, w) of depth image k in metres, 0 = missing, also beyond its rim. Raises UserError."""
-        z = self.images.depth(k)
-        taps = _both(self.own_depth, k, z.shape)
-        return z if taps is None else _interpolated_depth(z, *taps)
+        z, warp = self.images.depth(k), None if self.own_depth is None else self.own_depth.warp(k)
+        return z if warp is None else _interpolated_depth(z, warp)
 
 
 def read_own_intrinsics(root: Path, stream: StreamName, stamps: FloatArray, camera: Camera) -> OwnIntrinsics | None:
@@ -134,32 +104,40 @@ def _row(path: Path, number: int, line: str) -> list[float]:
     return row
 
 
-def _both(own: OwnIntrinsics | None, k: int, shape: tuple[int, ...]) -> tuple[Taps, Taps] | None:
-    """Of columns and rows."""
-    x, y = (None if own is None else own.taps(k, axis, shape[1 - axis]) for axis in (0, 1))
-    return None if x is None or y is None else (x, y)
-
-
-def _interpolated_color(image: ByteArray, x: Taps, y: Taps) -> ByteArray:
+def _interpolated_color(image: ByteArray, warp: FloatArray) -> ByteArray:
     """OpenCV rounds positions to 1/32 pixel, which no 8-bit image shows, and takes a seventh of NumPy's time."""
-    warp = np.array([[x.scale, 0.0, x.shift], [0.0, y.scale, y.shift]])
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = image.shape[1], image.shape[0]
     return np.asarray(cv2.warpAffine(image, warp, size, flags=how, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-def _interpolated_depth(z: Float32Array, x: Taps, y: Taps) -> Float32Array:
+def _interpolated_depth(z: Float32Array, warp: FloatArray) -> Float32Array:
     """1/z is linear on a plane. The nearest pixel where the four are not of one surface, or not all there."""
+    (x, wx, x_inside), (y, wy, y_inside) = (
+        _taps(float(warp[axis, axis]), float(warp[axis, 2]), z.shape[1 - axis]) for axis in (0, 1)
+    )
     with np.errstate(divide="ignore", invalid="ignore"):  # of what is missing
         rho = np.float32(1.0) / z
-        a, b, c, d = (rho[rows][:, columns] for rows in (y.first, y.second) for columns in (x.first, x.second))
-        wy, wx = y.weight[:, None], x.weight[None, :]
+        a, b, c, d = (rho[rows][:, columns] for rows in (y, y + (wy > 0)) for columns in (x, x + (wx > 0)))
+        nearest = z[y + (wy > 0.5)][:, x + (wx > 0.5)]
+        wy, wx = wy[:, None], wx[None, :]
         mixed = (a * (1 - wx) + b * wx) * (1 - wy) + (c * (1 - wx) + d * wx) * wy
         four = a, b, c, d
         least, most = np.minimum.reduce(four), np.maximum.reduce(four)
-        smooth = (most - least <= _ONE_SURFACE * least) | _straight(rho)[y.first][:, x.first]
-        found = np.where(smooth & np.isfinite(most), np.float32(1.0) / mixed, z[y.nearest][:, x.nearest])
-    return np.where(y.inside[:, None] & x.inside[None, :], found, np.float32(0.0))
+        smooth = (most - least <= _ONE_SURFACE * least) | _straight(rho)[y][:, x]
+        found = np.where(smooth & np.isfinite(most), np.float32(1.0) / mixed, nearest)
+    return np.where(y_inside[:, None] & x_inside[None, :], found, np.float32(0.0))
+
+
+def _taps(scale: float, shift: float, size: int) -> tuple[IntArray, Float32Array, npt.NDArray[np.bool_]]:
+    """Interpolation at scale · pixel + shift along an axis of n pixels, outside of which is its rim.
+
+    One neighbour (n,), the weight (n,) of the next one, and whether (n,) there is an image.
+    """
+    positions = scale * np.arange(size) + shift
+    held = np.clip(positions, 0.0, size - 1.0)
+    first = np.clip(np.floor(held).astype(np.int64), 0, max(size - 2, 0))
+    return first, (held - first).astype(np.float32), positions == held
 
 
 def _straight(rho: Float32Array) -> np.ndarray:

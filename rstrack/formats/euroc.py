@@ -64,7 +64,6 @@ def read(path: Path, _: ReadOptions) -> Recording:
         color=color,
         depth=depth,
         T_color_depth=T_color_depth,
-        is_registered=False,
         depth_scale=float(scale),
         items=_items(root, listed, color.camera, depth.camera, T_body["cam0"]),
         images=sum(len(files) for files in listed.values()),

@@ -75,7 +75,6 @@ def read(path: Path, options: ReadOptions) -> Recording:
         color=StreamCamera(color),
         depth=StreamCamera(depth),
         T_color_depth=np.eye(4),
-        is_registered=False,
         depth_scale=FLOAT_DEPTH_SCALE,
         items=_items(path, frames, meta, color, depth, unpack, options.confidence),
         images=2 * len(frames),

@@ -111,10 +111,10 @@ class Recording:
     color: StreamCamera
     depth: StreamCamera
     T_color_depth: FloatArray | None
-    is_registered: bool
     depth_scale: float
     items: Iterator[Item]
     images: int
+    is_registered: bool = False
     truth: str = ""
     is_measured: bool = False
     notes: tuple[str, ...] = ()

@@ -66,7 +66,6 @@ def read(path: Path, _: ReadOptions) -> Recording:
         color=StreamCamera(head.color),
         depth=StreamCamera(head.depth),
         T_color_depth=head.T_color_depth,
-        is_registered=False,
         depth_scale=head.depth_scale,
         items=_items(path, head, stamped),
         images=2 * head.frames,

@@ -66,7 +66,6 @@ def read(path: Path, options: ReadOptions) -> Recording:
         color=StreamCamera(color),
         depth=StreamCamera(depth),
         T_color_depth=np.eye(4),
-        is_registered=False,
         depth_scale=_MILLIMETRES,
         items=_items(path, rows, imu, color, depth, options.confidence),
         images=2 * len(rows),

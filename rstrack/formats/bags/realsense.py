@@ -62,7 +62,6 @@ def read_bag(bag: BagReader, named: ReadOptions) -> Recording:
         color=StreamCamera(color),
         depth=StreamCamera(depth),
         T_color_depth=T,
-        is_registered=False,
         depth_scale=float(f"{1.0 / _unit(bag, topics['depth'], prefixes['depth']):.6g}"),
         items=items_of(bag.path, images, imu, None if bag.is_ros1 else _own_stamps),
         images=sum(bag.topics[topic].count for topic in images),
