@@ -1,4 +1,4 @@
-"""The `rstrack` command: every function here and beside is a command, its parameters are the command's arguments."""
+"""The `rstrack` command. Functions here and beside are its commands, their parameters the commands' arguments."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from rstrack.cli.results import evaluate, export, keyframes, map_, map_eval, plo
 from rstrack.cli.tracking import CALIBRATE_STATUS, TRACK_STATUS, calibrate, refine, track
 
 _DESCRIPTION = """\
-rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D camera: every line has its own pose.
+rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D camera: every row has its own pose.
 
-  rstrack import mine.bag mine                         a folder of a ROS bag, or of what other recorders write
-  rstrack info out/demo                                what would be tracked
+  rstrack import mine.bag mine                         a ROS bag or another recording becomes a folder to track
+  rstrack info out/demo                                what a folder holds: cameras, frames, truth
   rstrack track out/demo --out runs/demo               track it; the trajectory is in runs/demo
   rstrack calibrate out/demo --out camera.yaml         readouts, clocks and extrinsics out of the recording itself
-  rstrack refine runs/demo --out runs/refined          every frame against all that saw the same: slow, and the best
+  rstrack refine runs/demo --out runs/refined          every frame against all that overlap it: slow, accurate
   rstrack evaluate out/demo runs/demo                  errors against the ground truth
   rstrack export runs/demo covariance --out demo.cov   poses with their covariances, for smfeval
   rstrack plot out/demo runs/demo --out demo.png       path and errors as a picture
-  rstrack report runs/demo                             all of it as one HTML page
-  rstrack map out/demo runs/demo --out mesh.ply        the surfaces that it saw, as a coloured mesh
+  rstrack report runs/demo                             tables, plots and the path as one HTML page
+  rstrack map out/demo runs/demo --out mesh.ply        the observed surfaces as a coloured mesh
   rstrack bench --quick                                every method on some sequences, beside the paper's figures
 
 A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D, ICL-NUIM or 7-Scenes folder; the first two of those
@@ -120,7 +120,7 @@ def import_(
 
 
 def info(sequence: SequenceFolder, *, camera: CameraFile = None, imu: ImuFile = None) -> int:
-    """Describe what would be tracked: cameras, shutters, frames, an IMU, truth."""
+    """Describe a folder that can be tracked: cameras, shutters, frames, IMU, truth."""
     from rstrack.cli.info import describe
     from rstrack.data.dataset import open_dataset
 

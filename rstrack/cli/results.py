@@ -1,4 +1,4 @@
-"""The commands on what a run left behind: `evaluate`, `plot`, `export`, `report`, `map`, `map-eval`, `keyframes`."""
+"""The commands that work on a finished run: `evaluate`, `plot`, `export`, `report`, `map`, `map-eval`, `keyframes`."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def evaluate(
     ] = None,
     json: Json = False,
 ) -> int:
-    """Errors of a run against the ground truth: ATE, drift per second, lines' poses, and whether the run's covariances
-    are as large."""
+    """Compare a run with the ground truth: ATE, drift per second, poses of rows, and whether its covariances fit the
+    errors."""
     from rstrack.metrics.evaluate import compared
     from rstrack.metrics.run_evaluate import run_evaluate
 
@@ -51,7 +51,7 @@ def plot(
     truth_offset: TruthOffset = None,
     out: Annotated[Path, "png, pdf or svg file to write", "FILE"],
 ) -> int:
-    """Picture of a run: path, errors over time, inliers."""
+    """Draw a run: path, errors over time, inliers."""
     from rstrack.charts.runs import run_plot
 
     run_plot(sequence, run, out, camera, truth_offset)
@@ -70,7 +70,7 @@ def export(
     *,
     out: Annotated[Path, "file to write", "FILE"],
 ) -> int:
-    """Write what a run knows of itself for other tools."""
+    """Write a run's poses with their covariances for other tools."""
     from rstrack.metrics.consistency import write_covariances
 
     print(f"{out}: {write_covariances(run, out)} poses written")
@@ -89,7 +89,7 @@ def report(
     out: Annotated[Path | None, "page to write (default: report.html in the folder)", "FILE"] = None,
     quiet: Quiet = False,
 ) -> int:
-    """One HTML page of a run, a calibration, a benchmark or a stress test, all in it: tables, plots, the path in 3D,
+    """Write one HTML page of a run, a calibration, a benchmark or a stress test: tables, plots, the path in 3D,
     rolling against global shutter.
     """
     from rsgen.console.progress import ProgressDisplay
@@ -129,7 +129,7 @@ def map_eval(
     *,
     json: Json = False,
 ) -> int:
-    """How far a mesh is from the scene, and how much of what was seen it has."""
+    """Compare a mesh with the scene: its distance, and how much of the observed surface it has."""
     from rstrack.metrics.map_eval import run_map_eval
 
     print_figures(run_map_eval(mesh, scene), json)

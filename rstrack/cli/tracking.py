@@ -157,7 +157,7 @@ def calibrate(
     json: Json = False,
     quiet: Quiet = False,
 ) -> int:
-    """A recording's cameras from the recording alone: lenses, readouts, clocks and extrinsics, with their errors."""
+    """Find a recording's cameras from its images alone: lenses, readouts, clocks, extrinsics, with standard errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
     from rstrack.calibration.devices import device_named
