@@ -106,7 +106,7 @@ class _Lens(_Entry):
             raise UserError(f"{name}: {error}") from None
 
 
-class _Stream(_Lens):
+class _CameraStream(_Lens):
     readout_s: Seconds
     exposure_s: Seconds = 0.0
     scan: Scan = "top-bottom"
@@ -116,7 +116,7 @@ class _Stream(_Lens):
         return Shutter(self.readout_s, self.exposure_s, self.scan)
 
 
-class _ColorStream(_Stream):
+class _ColorStream(_CameraStream):
     offset_s: Finite | Literal["auto"] = "auto"
     falloff: Annotated[float, Field(ge=-0.5, le=2.0, allow_inf_nan=False)] | Literal["auto"] = "auto"
     drift_ppm: Drift = 0.0
@@ -127,7 +127,7 @@ class _RecordingClock(_Entry):
     drift_ppm: Drift = 0.0
 
 
-class _Sensor(_Lens):
+class _RegisteredSensor(_Lens):
     T_color_sensor: Matrix4 | None = None
 
 
@@ -137,13 +137,13 @@ class _DepthError(_Entry):
     radial: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
 
 
-class _DepthStream(_Stream):
+class _DepthStream(_CameraStream):
     depth_scale: Annotated[float, Field(ge=1, allow_inf_nan=False)] = DEPTH_SCALE
     offset_s: Finite = 0.0
     error: _DepthError = _DepthError()
     # Warped into the colour camera; sensor: the camera it was warped from, whose lines readout_s and scan are about.
     registered: bool = False
-    sensor: _Sensor | None = None
+    sensor: _RegisteredSensor | None = None
 
     @model_validator(mode="after")
     def _only_registered_has_a_sensor(self) -> _DepthStream:

@@ -112,7 +112,7 @@ def _replace(part: Path, out: Path) -> None:
 
 
 @dataclass
-class _Samples:
+class _SensorSamples:
     """What one sensor of an IMU measured, in the order of the file."""
 
     ns: array[int] = field(default_factory=lambda: array("q"))
@@ -138,8 +138,8 @@ class _Import:
     file: str
     notes: list[str]
     images: dict[str, list[tuple[int, int | None, str]]] = field(default_factory=lambda: {"color": [], "depth": []})
-    gyro: _Samples = field(default_factory=_Samples)
-    accel: _Samples = field(default_factory=_Samples)
+    gyro: _SensorSamples = field(default_factory=_SensorSamples)
+    accel: _SensorSamples = field(default_factory=_SensorSamples)
     poses: list[RecordedPose] = field(default_factory=list)
     intrinsics: list[ImageIntrinsics] = field(default_factory=list)
 

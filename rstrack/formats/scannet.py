@@ -33,7 +33,7 @@ _SKEW = 1e-2
 
 
 @dataclass(frozen=True)
-class _Head:
+class _SensHeader:
     color: Camera
     depth: Camera
     T_color_depth: FloatArray
@@ -83,7 +83,7 @@ def _take(path: Path, file: BinaryIO, size: int, most: int) -> bytes:
     return data
 
 
-def _head(path: Path, file: BinaryIO) -> _Head:
+def _head(path: Path, file: BinaryIO) -> _SensHeader:
     version, length = struct.unpack("<IQ", _take(path, file, 12, 12))
     if version != _VERSION:
         raise UserError(f"{path}: is no .sens file of version {_VERSION}")
@@ -103,7 +103,7 @@ def _head(path: Path, file: BinaryIO) -> _Head:
     color = camera_of(str(path), cw, ch, (K_color[0, 0], K_color[1, 1], K_color[0, 2], K_color[1, 2]), "", ())
     depth = camera_of(str(path), dw, dh, (K_depth[0, 0], K_depth[1, 1], K_depth[0, 2], K_depth[1, 2]), "", ())
     T_color_depth = se3.orthonormalise(np.linalg.inv(X_color) @ X_depth)
-    return _Head(color, depth, T_color_depth, float(shift), depth_kind, frames, file.tell(), sensor)
+    return _SensHeader(color, depth, T_color_depth, float(shift), depth_kind, frames, file.tell(), sensor)
 
 
 def _is_rigid(T: FloatArray) -> bool:
@@ -113,7 +113,7 @@ def _is_rigid(T: FloatArray) -> bool:
     return bool(np.abs(R.T @ R - np.eye(3)).max() < _SKEW and np.linalg.det(R) > 0)
 
 
-def _walk(path: Path, file: BinaryIO, head: _Head) -> bool:
+def _walk(path: Path, file: BinaryIO, head: _SensHeader) -> bool:
     """Whether frames are stamped. Raises UserError where the file ends before the last frame does."""
     size, stamped = path.stat().st_size, False
     for _ in range(head.frames):
@@ -126,7 +126,7 @@ def _walk(path: Path, file: BinaryIO, head: _Head) -> bool:
     return stamped
 
 
-def _items(path: Path, head: _Head, stamped: bool) -> Iterator[Item]:
+def _items(path: Path, head: _SensHeader, stamped: bool) -> Iterator[Item]:
     with path.open("rb") as file:
         file.seek(head.begin)
         for k in range(head.frames):
@@ -145,14 +145,14 @@ def _items(path: Path, head: _Head, stamped: bool) -> Iterator[Item]:
                 yield RecordedImage("depth", 1000 * depth_us, png)
 
 
-def _world_color(T_world_depth: FloatArray, head: _Head) -> FloatArray:
+def _world_color(T_world_depth: FloatArray, head: _SensHeader) -> FloatArray:
     """NaN where there is no pose: ScanNet writes −∞ for a frame that was lost."""
     if not _is_rigid(T_world_depth):
         return np.full((4, 4), np.nan)
     return se3.orthonormalise(T_world_depth) @ se3.inverse(head.T_color_depth)
 
 
-def _depth(where: str, data: bytes, head: _Head) -> bytes:
+def _depth(where: str, data: bytes, head: _SensHeader) -> bytes:
     wanted = 2 * head.depth.width * head.depth.height
     if head.depth_kind == _ZLIB_DEPTH:
         try:

@@ -69,7 +69,7 @@ class BagReader:
         counts = dict.fromkeys(topics, 0)
         if not connections:
             return
-        for connection, arrival_ns, raw in _told(self.path, self._reader.messages(connections)):
+        for connection, arrival_ns, raw in _guarded(self.path, self._reader.messages(connections)):
             topic, number = str(connection.topic), counts[connection.topic]
             counts[connection.topic] += 1
             where = f"{self.path}: message {number} of {topic}"
@@ -148,7 +148,7 @@ def _starts(path: Path, start: bytes) -> bool:
         return file.read(len(start)) == start
 
 
-def _told(path: Path, messages: Iterator[Any]) -> Iterator[Any]:
+def _guarded(path: Path, messages: Iterator[Any]) -> Iterator[Any]:
     """The messages; what goes wrong between them as a UserError."""
     while True:
         try:
@@ -231,7 +231,7 @@ def bound_unpacking() -> None:
 
     def opened(file: Any, mode: str) -> Any:
         size = Path(file.name).stat().st_size
-        return _Counted(zstd.open(file, mode), max(_MOST_GROWTH * size, _LEAST_BYTES))
+        return _BoundedFile(zstd.open(file, mode), max(_MOST_GROWTH * size, _LEAST_BYTES))
 
     storage_mcap.DECOMPRESSORS |= {"zstd": unzstd, "lz4": unlz4}
     # Of folders whose files or messages are packed.
@@ -248,13 +248,13 @@ def bound_rows(reader: Any) -> None:
             connection.limit(apsw.SQLITE_LIMIT_LENGTH, _MOST_CHUNK_BYTES)
 
 
-class _Counted:
+class _BoundedFile:
     """A file that is read to its end, of `most` bytes at most."""
 
     def __init__(self, file: Any, most: int) -> None:
         self._file, self._most, self._left = file, most, most
 
-    def __enter__(self) -> _Counted:
+    def __enter__(self) -> _BoundedFile:
         return self
 
     def __exit__(self, *_: object) -> None:
