@@ -124,10 +124,7 @@ def read_imu_yaml(path: Path) -> ImuDescription:
             "gyroscope_matrix and accelerometer_matrix (3x3, true to measured), without 'model'"
         )
     kept = {str(key): value for key, value in data.items() if key not in (*_KALIBR, "model")}
-    try:
-        yaml = _ImuYaml.model_validate(kept)
-    except ValidationError as error:
-        raise UserError(f"{path}: {_first(error)}") from None
+    yaml = _validated(path, kept)
     matrices = [_invertible(path, name, getattr(yaml, name)) for name in ("gyroscope_matrix", "accelerometer_matrix")]
     return ImuDescription(
         path.name, _noise(path, yaml), yaml.update_rate, _rigid(path, "T_imu_depth", yaml.T_imu_depth),
@@ -158,11 +155,9 @@ def of_sequence(path: Path, meta: Mapping[str, Any]) -> ImuDescription | None:
         return None
     names = (*DENSITIES, "accelerometer_range", "gyroscope_range", "T_imu_depth")
     kept = {name: section[name] for name in names if section.get(name) is not None}
+    yaml = _validated(path, kept | {"update_rate": section.get("rate_hz")}, "config", "imu")
     try:
-        yaml = _ImuYaml.model_validate(kept | {"update_rate": section.get("rate_hz")})
         gravity = float(np.linalg.norm(np.array(section.get("gravity", (0.0, -STANDARD_GRAVITY, 0.0)), float)))
-    except ValidationError as error:
-        raise UserError(f"{path}: config.imu.{first_problem(error)}") from None
     except (TypeError, ValueError):
         gravity = np.nan
     if not np.isfinite(gravity):
@@ -180,10 +175,7 @@ def read_sensor_yaml(path: Path) -> ImuDescription:
     """imu0/sensor.yaml of an EuRoC folder, and its pose against those of the cameras beside. Raises UserError."""
     data = read_asl_yaml(path)
     kept = {name: data[name] for name in DENSITIES if name in data} | {"update_rate": data.get("rate_hz")}
-    try:
-        yaml = _ImuYaml.model_validate(kept)
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)}") from None
+    yaml = _validated(path, kept)
     found = ImuDescription(f"{path.parent.name}/{path.name}", _noise(path, yaml), yaml.update_rate)
     T_body = {name: body_pose(path.parents[1] / name / path.name) for name in ("imu0", "depth0", "cam0")}
     if (T_body_imu := T_body["imu0"]) is None:
@@ -263,8 +255,13 @@ def _invertible(path: Path, name: str, value: Matrix3 | None) -> FloatArray | No
     return matrix
 
 
-def _first(error: ValidationError) -> str:
-    first = error.errors()[0]
-    if first["type"] == "extra_forbidden":
-        return f"{'.'.join(str(part) for part in first['loc'])}: no such entry: see docs/format.md, imu.yaml"
-    return first_problem(error)
+def _validated(path: Path, data: Mapping[str, Any], *within: str) -> _ImuYaml:
+    """within: the entries that it lies in, for messages. Raises UserError."""
+    try:
+        return _ImuYaml.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        if first["type"] == "extra_forbidden":
+            name = ".".join(str(part) for part in first["loc"])
+            raise UserError(f"{path}: {name}: no such entry: see docs/format.md, imu.yaml") from None
+        raise UserError(f"{path}: {first_problem(error, *within)}") from None
