@@ -18,7 +18,7 @@ from fuzzing import ConfigVariant
 from nightly import QUICK_OR_ALL, sampled
 
 import rsgen.cli.main
-import rsgen.produce.generate
+import rsgen.produce.parts
 import rstrack.cli.main
 from rsgen.config.config import describe_fields
 from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png
@@ -78,7 +78,7 @@ def check(studio: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatc
     def begin_rendering(*_: Any, **__: Any) -> None:
         raise RenderingBegan
 
-    monkeypatch.setattr(rsgen.produce.generate, "FrameSource", begin_rendering)
+    monkeypatch.setattr(rsgen.produce.parts, "FrameSource", begin_rendering)
     monkeypatch.chdir(studio)
 
     def check(variant: ConfigVariant) -> bool:
