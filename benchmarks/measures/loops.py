@@ -111,7 +111,7 @@ def _tracked(dataset: Dataset, options: Options, frames: range, progress: Progre
         progress("tracking", (n + 1) / len(frames), dataset.name)
     spline = tracker.spline
     assert spline is not None
-    return search_of(tracker, tracker.all_keyframes(), spline, lambda index: dataset.frame(frames[index]))
+    return search_of(tracker, tracker.track.all_keyframes(), spline, lambda index: dataset.frame(frames[index]))
 
 
 def _accuracy(loops: Sequence[Loop], truth: Spline, times: dict[int, float]) -> Figures:

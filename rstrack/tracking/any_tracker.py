@@ -80,7 +80,7 @@ def make_tracker(
 ) -> AnyTracker:  # fmt: skip
     """The tracker of options.method; `timer` watches the parts of its work. load: as in `LoopTracker`.
 
-    interval_s: the usual time between frames, where that is known; otherwise the first two tell. imu: of a unit
+    interval_s: the median time between frames, where that is known; else that of the first two. imu: of a unit
     on the cameras; methods that use none take no notice. after: a tracker of the same recording; what it has learnt of
     the cameras is known from the start, where the method's tracker learns that.
 
@@ -105,5 +105,6 @@ def make_tracker(
         return LoopTracker(rig, options, timer, load, imu)
     made, first = Tracker(rig, options, timer, imu), None if after is None else after.uncorrected
     if isinstance(first, Tracker):
-        made.learn_cameras(first)
+        # Before the first frame: what is known of the cameras.
+        made.track.covariances.uncertainty = first.track.covariances.uncertainty.begun_anew()
     return made

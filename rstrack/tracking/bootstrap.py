@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,19 +17,19 @@ from rstrack.tracking.judgement.lost_track import lost
 from rstrack.tracking.moving.leave_out import LeftOut, left_out_with, without
 from rstrack.tracking.moving.majority import not_with_most
 from rstrack.tracking.succession import LEAST_DEPTH
-from rstrack.tracking.track import Track
+from rstrack.tracking.track import TrackState
 from rstrack.tracking.window import LEVELS, Window
 
 # Knots are never further apart than this many times the spacing that was asked for.
 _WIDEST = 2.0
 # Where depth gives one pose a knot, how far after a knot, in knots: half-way between two it would not see control
-# points that alternate, of which rolling colours then tell little and wrongly.
+# points that alternate, and rolling colours determine these badly.
 _AFTER_KNOT = 0.1
-# How far depth alone may slide in frames that begin a track, m: before a wall by 0.25 to 1.
+# How far depth alone may slide in frames that begin a track, m: before the corridor's wall it slid by 0.25 to 1.
 _MOST_APART_M = 0.1
 
 
-def start(track: Track, new: DeviceFrame) -> FrameReport:
+def start(track: TrackState, new: DeviceFrame) -> FrameReport:
     """The first frame. Its depth is enough to begin with: the first colour image often comes a little later."""
     if new.depth_share < LEAST_DEPTH or not (track.options.geometric or new.colors):
         return track.report(new, fault=Fault.NO_START)
@@ -45,8 +45,8 @@ def start(track: Track, new: DeviceFrame) -> FrameReport:
     return track.report(new, keyframe=True)
 
 
-def fit_knots(track: Track, gap: float) -> None:
-    """Knots for frames `gap` s apart; a global shutter gives one pose each: no more knots than that can be told."""
+def fit_knots(track: TrackState, gap: float) -> None:
+    """Knots for frames `gap` s apart; a global shutter gives one pose a frame, which determines no more knots."""
     window, _ = track.known()
     dt, first, phase = track.options.knots_s(gap), track.succession.recent[0], track.options.knot_phase
     if first.depth.exposure.lens.lines == 1 and gap > dt:
@@ -56,7 +56,7 @@ def fit_knots(track: Track, gap: float) -> None:
         _begin(track, first, dt, phase)
 
 
-def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
+def bootstrap(track: TrackState, new: DeviceFrame) -> FrameReport:
     """Joint alignment of the first frames with the first one, from zero motion."""
     window, ref = track.known()
     window.state.extend(new.last_time)
@@ -87,7 +87,7 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
         window.active = earlier
     if lost(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
-    track.usual.learn(fresh)
+    track.scales.learn(fresh)
     window.keep(fresh)
     recent = track.succession.recent
     recent.append(new)
@@ -105,11 +105,11 @@ def bootstrap(track: Track, new: DeviceFrame) -> FrameReport:
     return track.report(new, fresh, solved, keyframe=True)
 
 
-def _colors_roll(track: Track) -> bool:
+def _colors_roll(track: TrackState) -> bool:
     return track.options.rolling and track.rig.color_shutter.readout_s > 0.0
 
 
-def _begin(track: Track, first: DeviceFrame, dt: float, phase: float) -> Window:
+def _begin(track: TrackState, first: DeviceFrame, dt: float, phase: float) -> Window:
     """A spline with knots dt s apart, one of them `phase` knots before the first frame; a rolling first frame is what
     others are aligned to."""
     window = Window.still(track.terms, track.rig.depth_camera.fx, first, dt, phase, track.inertia)
@@ -119,7 +119,7 @@ def _begin(track: Track, first: DeviceFrame, dt: float, phase: float) -> Window:
     return window
 
 
-def _recolored(track: Track, window: Window, ref: Reference, fresh: Sequence[Observation]) -> Reference:
+def _recolored(track: TrackState, window: Window, ref: Reference, fresh: Sequence[Observation]) -> Reference:
     first = track.succession.recent[0]
     again = track.maker.rolling(first.index, first.depth, first.colors, window.spline)
     track.succession.reference = replace(again, T_world_base=ref.T_world_base)
@@ -129,9 +129,9 @@ def _recolored(track: Track, window: Window, ref: Reference, fresh: Sequence[Obs
 
 
 def _begin_with_most(
-    track: Track, ref: Reference, frames: Sequence[DeviceFrame], observations: Sequence[Observation]
+    track: TrackState, ref: Reference, frames: Sequence[DeviceFrame], observations: Sequence[Observation]
 ) -> None:
-    """Leave out of the first frame what does not move as most of it does, until the alignment tells it better."""
+    """Leave out of the first frame what does not move as most of it does, until the alignment shows what moves."""
     odd = not_with_most(track.device.e, [track.succession.recent[0], *frames], track.device.rays)
     if odd is not None and odd.any():
         rest = without(track.device.e, ref, odd)
@@ -139,60 +139,43 @@ def _begin_with_most(
             o.see(rest)
 
 
-def _begin_anew(track: Track, new: DeviceFrame) -> FrameReport:
+def _begin_anew(track: TrackState, new: DeviceFrame) -> FrameReport:
     """The first frames did not fit together: they are lost, and the newest is the first one."""
     track.begin_anew()
     track.reports = [report.as_lost(Fault.NO_START) for report in track.reports]
     return start(track, new)
 
 
-def _leave_out_by_last(track: Track, window: Window) -> None:
-    """What has hardly moved since the first frame has done so until the last one: left out of those between."""
-    *frames, last = track.succession.recent
-    _, ref = track.known()
-    rest = [
-        replace(frame, depth=left_out_with(track.space, frame.depth, last.depth, ref.median_depth, window.spline))
-        for frame in frames
-    ]
-    track.succession.recent = deque([*rest, last])
+# -- the first keyframe -----------------------------------------------------------------------------------------------
 
 
-def _leave(track: Track, window: Window) -> bool:
-    """Rectify the middle frame and align all others to it. Says whether they stay: before a wall depth alone slides."""
+def _leave(track: TrackState, window: Window) -> bool:
+    """Rectify the middle frame and align all others to it. Returns whether they stay."""
     if any(frame.depth.moving for frame in track.succession.recent):
         _leave_out_by_last(track, window)
     frames, covariances = list(track.succession.recent), track.covariances
-    middle = min(
-        (f for f in frames if not track.succession.is_unfit(f)),
-        key=lambda f: abs(f.index - frames[len(frames) // 2].index),
-    )
+    center = frames[len(frames) // 2].index
+    fit = (frame for frame in frames if not track.succession.is_unfit(frame))
+    middle = min(fit, key=lambda frame: abs(frame.index - center))
     ref = track.succession.make(middle, window.spline, None)
     window.active = []
-    others = [o for frame in frames if frame is not middle for o in track.observe(frame, ref)]
-    window.solve(others, levels=(0,))
     rest = [frame for frame in frames if frame is not middle]
-    left = track.leave_out(rest, ref, others, window.state)
-    if any(one.moves for one in left):
-        window.solve(others, levels=(0,))
-        for one in left:
-            track.succession.saw_through(one.gone)
-        cleaned = {frame.index: replace(frame, depth=one.depth) for frame, one in zip(rest, left, strict=True)}
-        track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in frames)
+    others = [o for frame in rest for o in track.observe(frame, ref)]
+    window.solve(others, levels=(0,))
+    _leave_out_once_more(track, window, ref, rest, others)
     seen_of = {frame.index: [o for o in others if o.frame == frame.index] for frame in frames}
     covariances.look_at(ref, window.spline)
     scores_of = {index: scores(seen, window.state) for index, seen in seen_of.items()}
-    by_depth = [seen for seen in seen_of.values() if seen and all(o.is_depth for o in seen)]
-    if any(np.trace(disagreement(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth):
+    if _slides(seen_of.values(), window):
         return False
-    if not all(_agree(track, seen_of[f.index], scores_of[f.index], window) for f in rest):
+    if not all(_agree(track, seen_of[frame.index], scores_of[frame.index], window) for frame in rest):
         return False
     window.keep(others)
     for frame in track.succession.recent:
         track.remember(frame)
     for frame in frames:
         seen, own = seen_of[frame.index], scores_of[frame.index]
-        track.chain.add(ref, seen, window.state, own.excess)
-        track.learn_inertia(seen, window, own.excess, frame.last_time)
+        track.learn_motion(ref, seen, window, own.excess, frame.last_time)
         covariances.uncertainty = covariances.uncertainty.found_anew(own.information)
         covariances.common = covariances.after(0.0, covariances.uncertainty, seen, window.state, own)
         if frame is not middle:
@@ -204,11 +187,42 @@ def _leave(track: Track, window: Window) -> bool:
     return True
 
 
-def _agree(track: Track, seen: Sequence[Observation], score: Scores, window: Window) -> bool:
-    """Whether a frame's pose is known in spite of what its images are apart, beyond what was usual before."""
-    covariances, usual = track.covariances, track.covariances.uncertainty.systematic.usual_inflation
+def _leave_out_by_last(track: TrackState, window: Window) -> None:
+    """What has hardly moved since the first frame has done so until the last one: left out of those between."""
+    *frames, last = track.succession.recent
+    _, ref = track.known()
+    rest = [
+        replace(frame, depth=left_out_with(track.space, frame.depth, last.depth, ref.median_depth, window.spline))
+        for frame in frames
+    ]
+    track.succession.recent = deque([*rest, last])
+
+
+def _leave_out_once_more(
+    track: TrackState, window: Window, ref: Reference, rest: Sequence[DeviceFrame], others: Sequence[Observation]
+) -> None:
+    """What moves, as it shows against the rectified keyframe: all are aligned again without it."""
+    left = track.leave_out(rest, ref, others, window.state)
+    if not any(one.moves for one in left):
+        return
+    window.solve(others, levels=(0,))
+    for one in left:
+        track.succession.saw_through(one.gone)
+    cleaned = {frame.index: replace(frame, depth=one.depth) for frame, one in zip(rest, left, strict=True)}
+    track.succession.recent = deque(cleaned.get(frame.index, frame) for frame in track.succession.recent)
+
+
+def _slides(seen_of: Iterable[Sequence[Observation]], window: Window) -> bool:
+    """Whether a frame that depth alone has aligned may have slid, as before a wall."""
+    by_depth = [seen for seen in seen_of if seen and all(o.is_depth for o in seen)]
+    return any(np.trace(disagreement(seen, window.state)[:3, :3]) > _MOST_APART_M**2 for seen in by_depth)
+
+
+def _agree(track: TrackState, seen: Sequence[Observation], score: Scores, window: Window) -> bool:
+    """Whether a frame's pose is known in spite of what its images are apart, beyond the running median."""
+    covariances, median = track.covariances, track.covariances.uncertainty.systematic.median_inflation
     if not covariances.uncertainty.systematic.inflations:
-        return True  # a wrong camera file has them apart in every frame, and no frame has told yet
+        return True  # a wrong camera file has them apart in every frame, and there was none yet
     considered, state = covariances.considered(0.0), window.state
-    apart = disagreement(seen, state, considered, usual) - disagreement(seen, state, considered, np.inf)
-    return replace(covariances.uncertainty.found_anew(score.information), doubt=apart).is_known
+    apart = disagreement(seen, state, considered, median) - disagreement(seen, state, considered, np.inf)
+    return replace(covariances.uncertainty.found_anew(score.information), mixture=apart).is_known

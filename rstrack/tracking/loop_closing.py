@@ -91,7 +91,7 @@ def close_loops(
     it is said in `Closing.problem`.
     """
     begin = time.perf_counter()
-    spline, keyframes = tracker.spline, tracker.all_keyframes()
+    spline, keyframes = tracker.spline, tracker.track.all_keyframes()
     if spline is None or len(keyframes) < 2:
         return Closing([], None, time.perf_counter() - begin)
     search = search_of(tracker, keyframes, spline, load)
@@ -114,9 +114,10 @@ def search_of(
     poses: Mapping[int, FloatArray] | None = None,
 ) -> LoopSearch:  # fmt: skip
     """The search for loops of a track; load: a frame by its number in the track; poses: as in `LoopSearch`."""
+    track = tracker.track
     return LoopSearch(
-        tracker.terms, tracker.rig, tracker.options, keyframes, lambda k: tracker.upload(k, load(k)), spline,
-        tracker.covariances.uncertainty.drift, judge_of(tracker), tracker.inflations, poses or {},
+        track.terms, track.rig, track.options, keyframes, lambda k: track.upload_again(k, load(k)), spline,
+        track.covariances.uncertainty.drift, judge_of(tracker), track.inflations, poses or {},
     )  # fmt: skip
 
 
@@ -131,18 +132,19 @@ def graph_of(tracker: Tracker, keyframes: Archive) -> Graph:
         small = keyframes.small(k)
         information = np.diag(np.repeat([turn * small.median_depth, turn], 3) ** -2.0)
         ties.append(Sighting(k, small.t, se3.inverse(T_world_base) @ spline.pose(small.t), information))
-    return Graph(State(spline, poses), tracker.seen, ties)
+    return Graph(State(spline, poses), tracker.track.chain.seen, ties)
 
 
 def judge_of(tracker: Tracker) -> Judge:
     """Judges a loop as a frame that nothing predicts, by what the track has learnt of its images and cameras."""
     # The tracker must go on to the same bits, whether or not loops are looked for.
-    covariances = replace(tracker.covariances, calibration=tracker.covariances.calibration.anew())
+    scales, own = tracker.track.scales, tracker.track.covariances
+    covariances = replace(own, calibration=own.calibration.anew())
 
     def judge(
         fresh: Sequence[Observation], solved: Solved, state: SplineState, ref: Reference
     ) -> tuple[str, FloatArray]:  # fmt: skip
-        fault, score, _ = judge_alone(tracker.usual, covariances, fresh, solved, state, ref.pixels)
-        return fault.value, score.information
+        verdict = judge_alone(scales, covariances, fresh, solved, state, ref.pixels)
+        return verdict.fault.value, verdict.score.information
 
     return judge

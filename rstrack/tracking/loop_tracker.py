@@ -20,7 +20,6 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.device.arrays import Engine
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -29,7 +28,7 @@ from rstrack.adjustment.loops import Loop, LoopSearch
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import Timer, untimed
-from rstrack.keyframes.archive import Archive, StoredFrames
+from rstrack.keyframes.archive import StoredFrames
 from rstrack.options import Options
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.loop_closing import Closing, graph_of, search_of
@@ -67,7 +66,7 @@ class LoopTracker:
         self._moves = Moves()
         # By what each keyframe was moved, and the one that frames are aligned to now.
         self._by_keyframe: dict[int, FloatArray] = {}
-        self._at, self._piece = -1, 0
+        self._at, self._segment_start = -1, 0
         self._looked: set[int] = set()
         self._loops: list[Loop] = []
         self._closed: Closed | None = None
@@ -149,7 +148,7 @@ class LoopTracker:
     def finished(self, progress: Progress = no_progress) -> Closing:
         """Look at what is left, and close all loops once more. No frame may follow."""
         begin = time.perf_counter()
-        self._tracker.all_keyframes()
+        self._tracker.track.all_keyframes()
         self._at = -1
         self._look()
         if self._loops:
@@ -159,25 +158,27 @@ class LoopTracker:
 
     def _follow(self) -> bool:
         """What is aligned to another keyframe from now on moves as that does. Whether it is."""
-        at, piece = self._tracker.reference, self._tracker.piece
+        at, window = self._tracker.reference, self._tracker.track.window
         if at is None or at == self._at:
             return False
         spline = self._tracker.spline
-        assert spline is not None
-        count = len(spline.control_points)
+        assert spline is not None and window is not None
+        count, begin = len(spline.control_points), window.segment_start
         before = self._moves.of(count - 1, 1)[0]
         T = self._by_keyframe.setdefault(at, self._by_keyframe.get(self._at, before))
         if not np.array_equal(T, before):
-            self._moves = self._moves.then(piece if piece != self._piece else count - _NEWEST, T)
-        self._at, self._piece = at, piece
+            self._moves = self._moves.then(begin if begin != self._segment_start else count - _NEWEST, T)
+        self._at, self._segment_start = at, begin
         return True
 
     def _keep(self) -> None:
         """Of a camera's images those of keyframes, and those that may become one."""
+        recent, archive = self._tracker.track.succession.recent, self._tracker.track.keyframes.archive
+        pending = recent[0].index if recent else len(self.reports)
         while self._held:
             number, frame = self._held[0]
-            is_keyframe = number == self._at or number in self._tracker.archive
-            if not is_keyframe and number >= self._tracker.pending:
+            is_keyframe = number == self._at or number in archive
+            if not is_keyframe and number >= pending:
                 break
             self._held.popleft()
             if is_keyframe:
@@ -185,7 +186,7 @@ class LoopTracker:
 
     def _look(self) -> None:
         """Look for loops of keyframes that have been left behind since, and close them if they say something new."""
-        spline, archive = self._tracker.spline, self._tracker.archive
+        spline, archive = self._tracker.spline, self._tracker.track.keyframes.archive
         fresh = sorted(k for k in archive.indices if k not in self._looked and k != self._at)
         if spline is None or not fresh:
             return
@@ -216,7 +217,7 @@ class LoopTracker:
 
     def _close(self, progress: Progress = no_progress) -> None:
         """Adjust everything to all loops."""
-        keyframes = self._tracker.all_keyframes()
+        keyframes = self._tracker.track.all_keyframes()
         graph = graph_of(self._tracker, keyframes)
         try:
             self._closed = closed(graph, self._loops, float(self._tracker.trajectory[0][0]), progress)
@@ -235,21 +236,6 @@ class LoopTracker:
             self._by_keyframe[self._at] = self._moves.points[-1]
 
     # -- checkpoints ------------------------------------------------------------------------------------------------
-
-    @property
-    def engine(self) -> Engine:
-        """Where it works."""
-        return self._tracker.engine
-
-    @property
-    def archive(self) -> Archive:
-        """Where its keyframes are put away."""
-        return self._tracker.archive
-
-    @property
-    def shared(self) -> dict[str, object]:
-        """What another tracker of the same rig and options has as well, by name."""
-        return self._tracker.shared
 
     @property
     def state(self) -> dict[str, Any]:

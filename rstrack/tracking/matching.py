@@ -14,12 +14,12 @@ from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.judgement.calibration_errors import Common
-from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, doubt, learnt, weighed
-from rstrack.tracking.judgement.lost_track import UsualScales, implausible, is_hopeless, is_settled, lost, misfits
+from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, learnt, mixture, weighed
+from rstrack.tracking.judgement.lost_track import RunningScales, implausible, is_hopeless, is_settled, lost, misfits
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
-from rstrack.tracking.track import Track
+from rstrack.tracking.track import TrackState
 from rstrack.tracking.window import Window
 
 
@@ -61,7 +61,7 @@ class Verdict:
 
 
 def match(
-    track: Track, begin: Callable[[], Window], new: DeviceFrame, ref: Reference, fresh: list[Observation],
+    track: TrackState, begin: Callable[[], Window], new: DeviceFrame, ref: Reference, fresh: list[Observation],
     levels: Sequence[int], last: DepthImage | None = None,
 ) -> Match:  # fmt: skip
     """Align a frame's observations, coarse to fine, from where a window has it; once more without images that misfit.
@@ -93,12 +93,12 @@ def match(
     return found
 
 
-def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verdict:
+def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) -> Verdict:
     """Whether a frame was found where the motion led; gap: s since the one before.
 
-    young: its piece of the spline has just begun, and predicts little. A rolling reference moves with what is aligned
-    to it, which tells nothing of the two together; a gyroscope sees how lines move within an image that vibrates, which
-    the filter does not; and under the wrong shutter all images are off: then no prediction is held against them.
+    young: its segment of the spline has just begun, and predicts little. A rolling reference moves with what is aligned
+    to it, and does not bind the two. A gyroscope sees how rows move within an image that vibrates, which the filter
+    does not. Under the wrong shutter all images are off. In these cases no prediction is held against them.
     """
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
@@ -117,45 +117,44 @@ def judge_predicted(track: Track, found: Match, gap: float, young: bool) -> Verd
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
-        if young and not fault and track.usual.exceeded(on_reference):
+        if young and not fault and track.scales.exceeded(on_reference):
             fault = Fault.MISFIT
         if not rolls:
             uncertainty = uncertainty.after(seconds, score.information, *accelerations)
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, score)
         if weighs:
-            more = doubt(innovation, on_reference, window.state, predicted, considered)
-            uncertainty = replace(uncertainty, doubt=more)
+            more = mixture(innovation, on_reference, window.state, predicted, considered)
+            uncertainty = replace(uncertainty, mixture=more)
         if weighs and not young:
             known = learnt(innovation, uncertainty.systematic, uncertainty.calibration, score.excess)
             uncertainty = replace(uncertainty, systematic=known[0], calibration=known[1])
         if young and not fault:
-            usual = uncertainty.systematic.usual_inflation
-            more = uncertainty.doubt + disagreement(on_reference, window.state, considered, usual)
-            uncertainty = replace(uncertainty, doubt=more)
+            median = uncertainty.systematic.median_inflation
+            more = uncertainty.mixture + disagreement(on_reference, window.state, considered, median)
+            uncertainty = replace(uncertainty, mixture=more)
     if not fault:
-        track.usual.learn(on_reference)
+        track.scales.learn(on_reference)
         if implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.MOTION
     return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
 
 
-def judge_unpredicted(track: Track, found: Match) -> Verdict:
+def judge_unpredicted(track: TrackState, found: Match) -> Verdict:
     """Whether a frame was found where nothing led."""
-    covariances, state = track.covariances, found.window.state
-    solved, expected = found.solved, found.ref.pixels
-    fault, score, uncertainty = judge_alone(track.usual, covariances, found.fresh, solved, state, expected)
+    state = found.window.state
+    verdict = judge_alone(track.scales, track.covariances, found.fresh, found.solved, state, found.ref.pixels)
     if not found.whole:
-        fault = Fault.MISFIT
-    if not fault:
-        track.usual.learn(found.fresh)
-    common = covariances.after(0.0, uncertainty, found.fresh, state, score)
-    return Verdict(fault, score, uncertainty, common)
+        verdict = replace(verdict, fault=Fault.MISFIT)
+    if not verdict.fault:
+        track.scales.learn(found.fresh)
+    common = track.covariances.after(0.0, verdict.uncertainty, found.fresh, state, verdict.score)
+    return replace(verdict, common=common)
 
 
 def judge_alone(
-    usual: UsualScales, covariances: PoseCovariances, fresh: Sequence[Observation], solved: Solved, state: SplineState,
-    expected: int,
-) -> tuple[Fault, Scores, Uncertainty]:  # fmt: skip
+    scales: RunningScales, covariances: PoseCovariances, fresh: Sequence[Observation], solved: Solved,
+    state: SplineState, expected: int,
+) -> Verdict:  # fmt: skip
     """Whether a frame was found, by its images alone: by all of them, as one is alike in many places.
 
     expected: pixels that a whole image puts on the keyframe.
@@ -163,13 +162,13 @@ def judge_alone(
     score = scores(fresh, state)
     uncertainty = covariances.uncertainty.found_anew(score.information)
     fault = lost(fresh, solved, expected)
-    if not fault and usual.exceeded(fresh):
+    if not fault and scales.exceeded(fresh):
         fault = Fault.MISFIT
     if not fault:
-        inflation = uncertainty.systematic.usual_inflation
-        apart = disagreement(fresh, state, covariances.considered(0.0), inflation)
-        uncertainty = replace(uncertainty, doubt=apart)
-    return fault or _unknown(uncertainty), score, uncertainty
+        median = uncertainty.systematic.median_inflation
+        apart = disagreement(fresh, state, covariances.considered(0.0), median)
+        uncertainty = replace(uncertainty, mixture=apart)
+    return Verdict(fault or _unknown(uncertainty), score, uncertainty, covariances.common)
 
 
 def without_misfits(fresh: list[Observation], ref: Reference) -> list[Observation]:

@@ -16,13 +16,17 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.judgement.lost_track import implausible
 from rstrack.tracking.matching import Match, Verdict, judge_unpredicted, match
-from rstrack.tracking.track import Track
+from rstrack.tracking.track import TrackState
 from rstrack.tracking.window import LEVELS, Window
 
 # Seconds for which an IMU alone leads: in two a phone's is off by some centimetres, from where images are not aligned.
 _LONGEST_S = 2.0
 # Frames in a row that show something, but not where the IMU leads: then it is no blackout.
 _MOST_ODD = 6
+# Keyframes at which a lost frame is looked for, at once.
+_PLACES = 3
+# An IMU is off by no more than a hand in so many seconds, s: 0.25 m and 27 degrees.
+_LED_OFF_S = 0.05
 
 
 @dataclass
@@ -32,8 +36,8 @@ class Bridge:
     over: list[DeviceFrame] = field(default_factory=list)
     odd: int = 0
 
-    def leads(self, track: Track, new: DeviceFrame) -> bool:
-        """Whether the motion since the last frame that was found is told well enough to look for a new one there."""
+    def leads(self, track: TrackState, new: DeviceFrame) -> bool:
+        """Whether the motion since the last frame that was found is known well enough to look for a new one there."""
         window, end = track.window, track.found.end
         return (
             window is not None
@@ -42,28 +46,22 @@ class Bridge:
             and window.is_led(end, new.last_time)
         )
 
-    def put(self, track: Track, new: DeviceFrame) -> None:
+    def put(self, track: TrackState, new: DeviceFrame) -> None:
         """A frame that was not found: lost, until one after it is."""
         self.over.append(new)
         self.odd += not track.succession.is_unfit(new)
 
-    def close(self, track: Track) -> None:
-        """A frame beyond was found, on the same piece of the spline: those before have poses, too."""
+    def close(self, track: TrackState) -> None:
+        """A frame beyond was found, on the same segment of the spline: those before have poses, too."""
         for frame in self.over:
             track.found.add(frame)
             report = track.reports[frame.index]
             track.reports[frame.index] = replace(report, lost=False, bridged=True)
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The track begins anew: what was lost stays so."""
         self.over, self.odd = [], 0
-
-
-# Keyframes at which a lost frame is looked for, at once.
-_PLACES = 3
-# An IMU is off by no more than a hand in so many seconds, s: 0.25 m and 27 degrees.
-_LED_OFF_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -82,14 +80,14 @@ class Relocaliser:
         self._lost_in_a_row = 0
         self._jump: _Jump | None = None
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """The camera has been found."""
         self._lost_in_a_row, self._jump = 0, None
 
     def find(
-        self, track: Track, new: DeviceFrame, T_led: FloatArray | None = None
+        self, track: TrackState, new: DeviceFrame, T_led: FloatArray | None = None
     ) -> tuple[Match, Verdict] | Fault:  # fmt: skip
-        """Where a frame was taken that follows a track's last ones, or why that cannot be told.
+        """Where a frame was taken that follows a track's last ones, or why it is not known.
 
         Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
         turn with the next frame, or at once where an IMU has led nearby. A pose that no hand can have brought the
@@ -117,7 +115,7 @@ class Relocaliser:
         return found, verdict
 
     def _searched(
-        self, track: Track, new: DeviceFrame, T_led: FloatArray | None
+        self, track: TrackState, new: DeviceFrame, T_led: FloatArray | None
     ) -> list[tuple[Reference, FloatArray]]:  # fmt: skip
         """The keyframe and T_ref_cam (4, 4) whose turn it is; where an IMU has led, all that are near, best first."""
         window, ref = track.known()
@@ -143,7 +141,7 @@ class Relocaliser:
         return [(places[chosen], T_ref_cam)]
 
     def _aligned(
-        self, track: Track, new: DeviceFrame, ref: Reference, T_ref_cam: FloatArray
+        self, track: TrackState, new: DeviceFrame, ref: Reference, T_ref_cam: FloatArray
     ) -> tuple[Match, Verdict]:  # fmt: skip
         window = track.known()[0]
         fresh = track.observe(new, ref, _matched(new, ref))

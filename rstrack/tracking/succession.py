@@ -26,6 +26,13 @@ from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.moving.leave_out import without
 from rstrack.tracking.window import Window
 
+# Part of the pixels that must have depth for a frame to become a keyframe.
+LEAST_DEPTH = 0.02
+# Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
+_COLORLESS = 5
+# Frames that have to see through a keyframe's pixel, or find it elsewhere, for it to be gone.
+_SEEN_THROUGH = 3
+
 
 @dataclass
 class Gains:
@@ -55,14 +62,6 @@ class Gains:
             own = brightness.absolute(color.brightness(state), color.ref.brightness)
         self.found = {k: b for k, b in self.found.items() if k >= oldest} | {frame.index: own}
         self.moments = frame.colors[0].moments
-
-
-# Part of the pixels that must have depth for a frame to become a keyframe.
-LEAST_DEPTH = 0.02
-# Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
-_COLORLESS = 5
-# Frames that have to see through a keyframe's pixel, or find it elsewhere, for it to be gone.
-_SEEN_THROUGH = 3
 
 
 class Succession:
@@ -99,9 +98,13 @@ class Succession:
         most = self._pixels[seen.ref.index] = max(self._pixels.get(seen.ref.index, 0), seen.pixels)
         return seen.pixels / most
 
-    def judged_colors(self, is_colorless: bool) -> None:
-        """Whether the newest frame's colours were left out."""
+    def view(self, frame: DeviceFrame, ref: Reference, fresh: Sequence[Observation], gone: Mask | None) -> float:
+        """How the newest frame sees the reference: with which colours, and through which pixels; returns `overlap`."""
+        is_colorless = bool(frame.colors and ref.points) and all(o.is_depth for o in fresh)
         self._colorless = self._colorless + 1 if is_colorless else 0
+        overlap = self.overlap(fresh)
+        self.saw_through(gone)
+        return overlap
 
     def saw_through(self, gone: Mask | None) -> None:
         """Pixels (gh, gw) of the reference's grid that the newest frame has found to be gone, if there are any.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from rsgen.array_types import FloatArray
 from rstrack.adjustment.chain import Chain
 from rstrack.alignment.free_space import FreeSpace
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.observation import Observation, Scores, observe
+from rstrack.alignment.observation import Observation, observe
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.priors import ACCELERATION
 from rstrack.alignment.spline_state import SplineState
@@ -20,34 +20,38 @@ from rstrack.alignment.weights import Independence
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
-from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer
+from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, frame_without
 from rstrack.images.pyramid import DepthImage
 from rstrack.inertial.band import with_knots
 from rstrack.inertial.estimate import ALIKE
 from rstrack.inertial.inertia import Inertia
+from rstrack.keyframes.archive import Archive
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.frame_report import Fault, FrameReport, frame_report
 from rstrack.tracking.judgement.consider import Calibration
-from rstrack.tracking.judgement.lost_track import UsualScales
+from rstrack.tracking.judgement.lost_track import RunningScales
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Gains, Succession
 from rstrack.tracking.window import FoundPoses, Window
 
+if TYPE_CHECKING:
+    from rstrack.tracking.matching import Match
+
 # What a track of the same rig and options would make in the same way.
 _MADE_ANEW = "rig", "options", "device", "terms", "maker", "space"
 
 
-class Track:
+class TrackState:
     """The spline as far as it has grown, the frames found on it, and what they said of the cameras.
 
-    window: None until there is a first frame. age: frames of the current piece of the spline. independence: of depth
+    window: None until there is a first frame. age: frames of the current segment of the spline. independence: of depth
     pixels, and of colour pixels. chain: what all frames said of the spline. reports: one of every frame fed.
     inertia: what an IMU says beside them, or None. left_out: of frames, since it moves by itself. is_modelled: whether
-    the times of the lines are. usual: how well frames fit.
+    the times of the lines are. scales: how well frames fit.
     """
 
     def __init__(self, rig: Rig, options: Options, timer: Timer, imu: ImuRecording | None = None) -> None:
@@ -60,7 +64,7 @@ class Track:
         self.keyframes = KeyframeStore(self.maker, self.options)
         # Taken for a global one, a rolling shutter makes both terms fit worse whenever the camera moves fast.
         self.is_modelled = self.options.rolling or rig.depth_shutter.readout_s == 0.0
-        self.usual = UsualScales()
+        self.scales = RunningScales()
         self.independence = Independence(), Independence()
         self.gains = Gains()
         self._finds_moving = self.options.moving and self.is_modelled
@@ -72,10 +76,10 @@ class Track:
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Nothing has been found of what was fed, nor is anything usual: at rest depth repeats its steps."""
-        self.usual.forget()
+        """Nothing has been found of what was fed, and no scale is known: at rest depth repeats its steps."""
+        self.scales.reset()
         self.window: Window | None = None
-        self._told_by = -1
+        self._keyframe = -1
         if self.inertia is not None:
             self.inertia.begin_world()
         self.found, self.chain, self.left_out = FoundPoses(), Chain(), MovingMasks()
@@ -102,6 +106,17 @@ class Track:
         self.device.resolution = own.pop("resolution")
         vars(self).update(own)
 
+    def all_keyframes(self) -> Archive:
+        """All rectified keyframes, the newest put away with them."""
+        self.keyframes.archive_newest()
+        return self.keyframes.archive
+
+    @property
+    def inflations(self) -> tuple[float, float]:
+        """By how much the covariances that depth's pixels give are too small, and colour's."""
+        depth, color = self.independence
+        return depth.inflation, color.inflation
+
     @property
     def has_gyro(self) -> bool:
         """Whether a gyroscope tells the motion beside the images."""
@@ -124,6 +139,11 @@ class Track:
         """Frame `index` on the device, its colour taken when it is known to have been by now."""
         return self.device.upload(index, frame, self.covariances.color_late[0])
 
+    def upload_again(self, index: int, frame: Frame) -> DeviceFrame:
+        """Frame `index` once more, without what has been found to move in it."""
+        new, mask = self.upload(index, frame), self.left_out.grid(index)
+        return new if mask is None else frame_without(self.device.e, new, mask, self.left_out.stride)
+
     def observe(self, frame: DeviceFrame, ref: Reference, expected: FloatArray | None = None) -> list[Observation]:
         """What the frame's images say against a reference, as far as their pixels are independent.
 
@@ -136,17 +156,35 @@ class Track:
             o.independent = 1.0 / self.independence[not o.is_depth].inflation
         return observations
 
-    def learn(
-        self, ref: Reference, on_reference: Sequence[Observation], window: Window, score: Scores, end: float
-    ) -> None:  # fmt: skip
-        """What a frame that was found, and ends at time `end` (s), says of the spline and of its pixels.
+    def learn(self, found: Match, excess: float, new: DeviceFrame) -> None:
+        """What frame `new`, found where the motion led, says of the spline, the IMU and its own pixels.
 
-        on_reference: its observations of `ref`.
+        excess: see `Scores`.
         """
-        self.chain.add(ref, on_reference, window.state, score.excess)
-        self.learn_inertia(on_reference, window, score.excess, end)
+        self.age += 1
+        self.succession.recent.append(new)
+        self.learn_motion(found.ref, found.on_reference, found.window, excess, new.last_time)
         for is_color, term in enumerate(self.independence):
-            term.learn(o.inflation for o in on_reference if o.is_depth != is_color)
+            term.learn(o.inflation for o in found.on_reference if o.is_depth != is_color)
+
+    def learn_motion(
+        self, ref: Reference, seen: Sequence[Observation], window: Window, excess: float, end: float
+    ) -> None:  # fmt: skip
+        """What a frame's observations of `ref` say of the spline, and of an IMU's biases and gravity."""
+        self.chain.add(ref, seen, window.state, excess)
+        if self.inertia is not None:
+            self._shift_inertia(seen)
+            models = [o.model(window.state).scaled(1.0 / (ALIKE * excess**2)) for o in seen if o.is_linearised]
+            self.inertia.learn(window.state, window.segment_start, models, end)
+
+    def begin_segment(self, found: Match, excess: float, new: DeviceFrame) -> None:
+        """A lost frame `new` was found at a keyframe: the spline goes on with a segment of its own."""
+        self.age = 1
+        self.chain.cut(found.window.segment_start)
+        self.succession.use(found.ref, new)
+        if self.inertia is not None:
+            self.inertia.begin_segment()
+        self.learn_motion(found.ref, found.fresh, found.window, excess, new.last_time)
 
     def leave_out(
         self, frames: Sequence[DeviceFrame], ref: Reference, fresh: Sequence[Observation], state: SplineState,
@@ -167,29 +205,22 @@ class Track:
         if frame.depth.left_out is not None:
             self.left_out.put(frame.index, frame.depth.left_out, frame.depth.left_out_stride)
 
-    def learn_inertia(self, fresh: Sequence[Observation], window: Window, excess: float, end: float) -> None:
-        """What a frame that ends at time `end` (s) says of an IMU's biases and of gravity. excess: see `Scores`."""
-        if self.inertia is not None:
-            self._shift_inertia(fresh)
-            models = [o.model(window.state).scaled(1.0 / (ALIKE * excess**2)) for o in fresh if o.is_linearised]
-            self.inertia.learn(window.state, window.piece, models, end)
-
     def accelerations(self, window: Window, seconds: float, R_world_depth: FloatArray) -> tuple[FloatArray, float]:
         """σ (6,) of accelerations over so many seconds, beyond what is known, m/s² and rad/s², and of the angular rate,
         rad/s: an IMU tells most. R_world_depth (3, 3): about how the camera is turned."""
         if self.inertia is None or seconds <= 0.0 or not window.is_led(self.found.end, self.found.end + seconds):
             return ACCELERATION, np.inf
-        told, rate = self.inertia.sigmas_over(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_world_depth.T)
-        return np.minimum(ACCELERATION, told), rate
+        sigmas, rate = self.inertia.sigmas_over(seconds, self.inertia.recording.T_imu_depth[:3, :3] @ R_world_depth.T)
+        return np.minimum(ACCELERATION, sigmas), rate
 
     def _shift_inertia(self, fresh: Sequence[Observation]) -> None:
         """An IMU knows nothing of keyframes: that another one lies a little off is no motion."""
-        index = next((o.ref.index for o in fresh if o.ref.rolling is None), self._told_by)
+        index = next((o.ref.index for o in fresh if o.ref.rolling is None), self._keyframe)
         drift = self.covariances.uncertainty.drift
-        if self.inertia is not None and self._told_by in drift and index in drift and index != self._told_by:
-            older, newer = sorted((index, self._told_by))
+        if self.inertia is not None and self._keyframe in drift and index in drift and index != self._keyframe:
+            older, newer = sorted((index, self._keyframe))
             self.inertia.shift(drift[newer] - drift[older])
-        self._told_by = index
+        self._keyframe = index
 
     def placed(self, new: DeviceFrame, fresh: Sequence[Observation] = (), joined: bool = True) -> None:
         """A frame has been found: its stamp, its brightness, and until when the spline is known."""

@@ -47,17 +47,17 @@ _LED_STEPS, _LED = 4, 1e-2
 class Window:
     """A spline and the observations of it.
 
-    piece: first control point of the current piece of the spline; those before it belong to another, or to a gap.
+    segment_start: first control point of the spline's current segment; those before it belong to another, or to a gap.
     first_free: first control point that moves when `solve` is called; all after it do. `active`: observations of
     earlier frames that touch those. `focal`: the depth camera's, in pixels. inertia: an IMU beside the images, or None.
     """
 
     def __init__(
-        self, terms: Terms, focal: float, state: SplineState, piece: int = 0, inertia: Inertia | None = None
+        self, terms: Terms, focal: float, state: SplineState, segment_start: int = 0, inertia: Inertia | None = None
     ) -> None:  # fmt: skip
         self._terms, self._focal, self._inertia = terms, focal, inertia
-        self.state, self.piece = state, piece
-        self.first_free = piece
+        self.state, self.segment_start = state, segment_start
+        self.first_free = segment_start
         self.active: list[Observation] = []
         self._led: ReusedPrior | None = None
         self._is_held = False
@@ -79,7 +79,7 @@ class Window:
 
     def copy(self) -> Window:
         """A window that can be changed without changing this one."""
-        twin = Window(self._terms, self._focal, self.state.copy(), self.piece, self._inertia)
+        twin = Window(self._terms, self._focal, self.state.copy(), self.segment_start, self._inertia)
         twin.first_free, twin.active, twin._is_held = self.first_free, list(self.active), self._is_held
         return twin
 
@@ -87,16 +87,16 @@ class Window:
         """Go on with constant velocity, or as an IMU leads, from time `end` (s) until the frame is covered; what it
         touches is free, and with an IMU what is known of in `Inertia.ahead`, which the frames before are in.
 
-        young: the piece's first frame alone does not tell its velocity; all of the piece stays free. Where frames are
-        missing, and an IMU leads over the gap, all control points in it are free.
+        young: the segment's first frame alone does not determine its velocity; all of the segment stays free. Where
+        frames are missing, and an IMU leads over the gap, all control points in it are free.
         """
         begin, held, self._led = self.state.segment(new.first_time), None, None
         if self.is_led(end, new.last_time):
             self.state.extend(new.last_time)
             begin = min(begin, self.state.segment(end))
-            held = None if young or self._inertia is None else self._inertia.held(self.piece)
+            held = None if young or self._inertia is None else self._inertia.held(self.segment_start)
             self._is_held = held is not None
-            first = max(self.piece, min(self.first_free, begin)) if held is None else held
+            first = max(self.segment_start, min(self.first_free, begin)) if held is None else held
             self._follow_lead(first)
         else:
             self.state.smooth_end(end)
@@ -105,7 +105,7 @@ class Window:
         if held is not None:
             self.first_free, self.active = held, []
             return
-        self.first_free = self.piece if young else max(self.piece, begin)
+        self.first_free = self.segment_start if young else max(self.segment_start, begin)
         self.active = [o for o in self.active if o.is_linearised and o.lin.model.last > self.first_free]
 
     def is_led(self, begin: float, end: float) -> bool:
@@ -114,7 +114,7 @@ class Window:
 
     def _follow_lead(self, first: int) -> None:
         """Move the control points from `first` on to where the IMU has them; the images seen before hold those that
-        their lines told."""
+        their rows determine."""
         free = first, self.state.end
         priors = self._priors(free)
         active = [] if self._is_held else [o for o in self.active if o.is_linearised]
@@ -127,7 +127,7 @@ class Window:
                 break
 
     def restarted(self, new: DeviceFrame, end: float, T_world_body: FloatArray) -> Window:
-        """The same spline up to time `end` (s), and a new piece at rest at T_world_body (4, 4) for a new frame."""
+        """The same spline up to time `end` (s), and a new segment at rest at T_world_body (4, 4) for a new frame."""
         state = self.state.restarted(end, new.first_time, new.last_time, T_world_body)
         return Window(self._terms, self._focal, state, state.segment(new.first_time), self._inertia)
 
@@ -157,7 +157,7 @@ class Window:
         priors = self._priors(free)
         bandwidth = 6 * (free[1] - free[0]) if coupled or isinstance(priors[-1], ReusedPrior) else 24
         priors += [] if gauge is None else [_pose_prior(gauge)]
-        if self.piece > 0 and self.first_free == self.piece:
+        if self.segment_start > 0 and self.first_free == self.segment_start:
             priors.append(self._velocity_prior(free))
         problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth, predicted=self._is_held)
         try:
@@ -182,10 +182,10 @@ class Window:
         return [known]
 
     def _motion_prior(self, free: tuple[int, int]) -> Prior:
-        first, last = max(self.piece, free[0] - 2), free[1]
+        first, last = max(self.segment_start, free[0] - 2), free[1]
         common = ACCELERATION if self._inertia is None else self._inertia.common
         count, newest, oldest = last - first - 2, 0 if self._inertial(free) else ENDS, 0
-        if free[0] == self.piece and not self._tells_from(self.spline.t0 + self.piece * self.state.dt):
+        if free[0] == self.segment_start and not self._informs(self.spline.t0 + self.segment_start * self.state.dt):
             oldest = max(0, min(ENDS, count - ENDS))
         sigma = acceleration_sigmas(common, self.state.dt, count, oldest, newest)
         return lambda spline: acceleration_prior(spline, first, last, sigma)
@@ -197,11 +197,11 @@ class Window:
             return []
         known = self._led
         if known is None or known.state is not self.state or known.first > free[0] or known.end != self.state.end:
-            known = self._led = inertia.prior(self.state, self.piece, free[0])
+            known = self._led = inertia.prior(self.state, self.segment_start, free[0])
         return [known]
 
-    def _tells_from(self, begin: float) -> bool:
-        """Whether an IMU says how the motion changes in a piece's first control points, that begins at a time (s)."""
+    def _informs(self, begin: float) -> bool:
+        """Whether an IMU measures how the motion changes in the first control points of a segment from `begin` (s)."""
         return (
             self._inertia is not None
             and self._inertia.is_informative
@@ -209,7 +209,7 @@ class Window:
         )
 
     def _velocity_prior(self, free: tuple[int, int]) -> Prior:
-        """What is known of the motion of a piece that has just begun."""
+        """What is known of the motion of a segment that has just begun."""
         sigma = VELOCITY * self.state.dt
         return lambda spline: velocity_prior(spline, *free, sigma)
 
@@ -222,7 +222,7 @@ def _pose_prior(ref: Reference) -> Prior:
 class FoundPoses:
     """stamps: of the frames that were found. valid: times (begin, end) in s within which the spline is an estimate.
 
-    Poses of the first frames are kept here once nothing moves them; the others are the spline's.
+    Poses of the first frames are stored here once nothing moves them; the others are the spline's.
     """
 
     def __init__(self) -> None:
@@ -236,7 +236,7 @@ class FoundPoses:
         return self.valid[-1][1]
 
     def add(self, new: DeviceFrame, joined: bool = True) -> None:
-        """A frame that has been found; joined: to the frames before it, not with a piece of its own."""
+        """A frame that has been found; joined: to the frames before it, not with a segment of its own."""
         self.stamps.append(new.stamp)
         begin = min(new.first_time, new.stamp)
         if joined and self.valid:
@@ -247,7 +247,7 @@ class FoundPoses:
         """Stamps (n,) and poses T_world_depth (n, 4, 4)."""
         return np.array(self.stamps), np.concatenate([self._settled.points, self._moving(spline, len(self.stamps))])
 
-    def begin_piece(self, before: Spline, untouched: float) -> None:
+    def begin_segment(self, before: Spline, untouched: float) -> None:
         """All poses stay as they are with the spline `before`, which is another one from time `untouched` (s) on."""
         self._settled.put(self._settled.count, self._moving(before, len(self.stamps)))
         begin, end = self.valid.pop()

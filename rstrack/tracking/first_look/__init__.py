@@ -27,5 +27,5 @@ def looked_at(dataset: Dataset, chosen: range, options: Options, progress: Progr
         dataset = dataset.with_color_offset(offset.offset_s, offset.text(), sigma_s=offset.sigma_in_all_s)
     if wants_vignetting:
         found = estimate_vignetting(dataset, tracks, progress)
-        dataset = dataset.with_color_falloff(found.falloff, found.text())
+        dataset = dataset.with_color_falloff(found.strength, found.text())
     return dataset

@@ -35,7 +35,7 @@ _NEAR = 2
 _FEWEST = 400
 # The offset is taken for determined if its standard error is below this, and it lies inside of what was looked at.
 _MOST_SIGMA_S = 5e-3
-# σ of what the pairs of a part have wrong alike: three parts of a recording told 2.9 ± 0.5, 6.1 ± 0.6, 4.3 ± 1.4 ms.
+# σ of what the pairs of a part have wrong alike: three parts of a recording gave 2.9 ± 0.5, 6.1 ± 0.6, 4.3 ± 1.4 ms.
 _SYSTEMATIC_S = 1.5e-3
 # Noise of colour images against each other, over their contrast, above which the track is not to be believed.
 _MOST_NOISE = 0.25

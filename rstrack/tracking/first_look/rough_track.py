@@ -25,12 +25,24 @@ from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 
 # Depth images as wide as that are thinned out: they take most of the time.
 _LARGE = 480
+# Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
+_TRACKED, _EVERY, _APART = 60, 4, (4, 8)
+# Windows of the recording of which the one that moves most is taken, and the shift (part of the width, a frame) that is
+# enough: images that move faster are blurred. Where it does not tell, others take its place, so many in all.
+_WINDOWS, _ENOUGH, _TRIES = 8, 0.015, 3
+# Depth pixels looked up in a line.
+_ACROSS = 106
+# 8-bit values that are clipped, and their neighbours; in any channel, since how bright images are is compared here.
+_BLACK, _WHITE = 4, 250
+_ROUNDS = 3
+# A depth image shows a point where it is no further off than this and this part of its distance: noise, and a pixel.
+_SAME_M, _SAME = 0.02, 0.02
 
 
 def rough_track(dataset: Dataset, frames: range, options: Options, done: Callable[[float], None]) -> AnyTracker:
     """The tracker of options.method after it has been fed the frames, as far as it, and the images, went.
 
-    done: told what part (0 to 1) of the frames it has seen.
+    done: called with what part (0 to 1) of the frames it has seen.
     """
     has_color = options.photometric
     step = 2 if dataset.rig.depth_camera.width >= _LARGE and not has_color else 1
@@ -52,20 +64,6 @@ def _thinned(camera: Camera, step: int) -> Camera:
     fx, fy, cx, cy = (value / step for value in (camera.fx, camera.fy, camera.cx, camera.cy))
     width, height = -(-camera.width // step), -(-camera.height // step)
     return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
-
-
-# Frames that are tracked; of these, every so manieth has its depth looked up in pairs of images so many frames apart.
-_TRACKED, _EVERY, _APART = 60, 4, (4, 8)
-# Windows of the recording of which the one that moves most is taken, and the shift (part of the width, a frame) that is
-# enough: images that move faster are blurred. Where it does not tell, others take its place, so many in all.
-_WINDOWS, _ENOUGH, _TRIES = 8, 0.015, 3
-# Depth pixels looked up in a line.
-_ACROSS = 106
-# 8-bit values that are clipped, and their neighbours; in any channel, since how bright images are is compared here.
-_BLACK, _WHITE = 4, 250
-_ROUNDS = 3
-# A depth image shows a point where it is no further off than this and this part of its distance: noise, and a pixel.
-_SAME_M, _SAME = 0.02, 0.02
 
 
 def moving_parts(dataset: Dataset, frames: range) -> list[range]:

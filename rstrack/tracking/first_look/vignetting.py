@@ -1,16 +1,15 @@
 """How much darker colour images are towards their corners (vignetting): from the recording itself.
 
 found = estimate_vignetting(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
-dataset = dataset.with_color_falloff(found.falloff, found.text())
+dataset = dataset.with_color_falloff(found.strength, found.text())
 
-It stays where it is while the scene passes by, which draws every alignment of colours towards no motion at all. A point
-that moves from the middle of an image to its edge gets darker than others that do not, whatever gain and offset the
-image has: so the falloff f in I = I_even / (1 + f ρ²) is told, with ρ the distance from the image's centre over that of
-its corners. Near enough to what lenses do (cos⁴ and a camera's response) to one per cent of the intensity.
+It stays where it is while the scene passes by, which biases every alignment of colours towards no motion. A point that
+moves from the middle of an image to its edge gets darker than others that do not, whatever gain and offset the
+image has. That determines f in I = I_even / (1 + f ρ²), with ρ the distance from the image's centre over that of its
+corners. This model is right to one per cent of the intensity (cos⁴ and a camera's response).
 
-What shines changes its brightness with the direction it is seen from, as if by a lens: along the true path parts of a
-recording differ by far more than their pairs do. So the estimate is one of a normal distribution, with that in its
-standard error, and with what is known of lenses before any image is seen.
+What shines changes its brightness with the viewing direction, as if by a lens: along the true path parts of a recording
+differ by far more than their pairs do. So the estimate has a normal prior, and that in its standard error.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, lo
 
 # The fewest points that a pair of images may share, and pairs.
 _FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
-# Mean and σ of the falloff of a lens that nothing is known of: TUM's cameras have 0.09 and 0.45.
+# Mean and σ of the vignetting of a lens that nothing is known of: TUM's cameras have 0.09 and 0.45.
 _PRIOR, _PRIOR_SIGMA = 0.15, 0.15
-# σ of what all pairs of a part have wrong alike: of one camera parts told 0.09, 0.09 and 0.02, of another, whose
+# σ of what all pairs of a part have wrong alike: of one camera parts gave 0.09, 0.09 and 0.02, of another, whose
 # truth is 0.15, -0.24 to 0.16.
 _SYSTEMATIC = 0.05
 _ROUNDS, _REWEIGHTED = 5, 4
@@ -39,19 +38,21 @@ _ROUNDS, _REWEIGHTED = 5, 4
 
 @dataclass(frozen=True)
 class Vignetting:
-    """falloff: f, not below 0. sigma: its standard error. pairs: of images compared, 0 where only the prior tells."""
+    """strength: f, not below 0. sigma: its standard error. pairs: of images compared, 0 where only the prior tells."""
 
-    falloff: float
+    strength: float
     sigma: float
     pairs: int
 
     def text(self) -> str:
         """One line for the screen."""
-        percent, error = (100.0 * x / (1.0 + self.falloff) for x in (self.falloff, self.sigma / (1.0 + self.falloff)))
+        percent, error = (
+            100.0 * x / (1.0 + self.strength) for x in (self.strength, self.sigma / (1.0 + self.strength))
+        )
         source = f"by {self.pairs} pairs of images" if self.pairs else "as lenses do"
         return (
             f"colours of the corners are {percent:.1f} % darker (± {error:.1f}, {source}): evened out; "
-            f"color.falloff: {self.falloff:.3f} in the camera file fixes it"
+            f"color.falloff: {self.strength:.3f} in the camera file fixes it"
         )
 
 
@@ -66,7 +67,7 @@ class _Pair:
 def estimate_vignetting(
     dataset: Dataset, tracks: Iterable[GeometricTrack | None], progress: Progress = no_progress
 ) -> Vignetting:
-    """The falloff of a dataset's colour images, from the part that moves most of those where enough pairs overlap.
+    """The vignetting of a dataset's colour images, from the part that moves most of those where enough pairs overlap.
 
     Raises UserError: an image that cannot be read.
     """
@@ -102,7 +103,7 @@ def _compared(dataset: Dataset, track: GeometricTrack, progress: Progress) -> li
 
 
 def _solved(pairs: Sequence[_Pair]) -> tuple[float, float]:
-    """Gauss-Newton for the one falloff, with gain and offset of every pair eliminated: it and its standard error, from
+    """Gauss-Newton for the one number, with gain and offset of every pair eliminated: it and its standard error, from
     leaving tenths of the pairs out and what all have wrong alike."""
     f = 0.0
     for _ in range(_ROUNDS):
@@ -118,7 +119,7 @@ def _solved(pairs: Sequence[_Pair]) -> tuple[float, float]:
 
 
 def _linearised(pair: _Pair, f: float) -> tuple[float, float]:
-    """H and g of the falloff, from one pair's residuals b' − gain a' − offset with Student-t weights (ν = 5)."""
+    """H and g of the vignetting, from one pair's residuals b' − gain a' − offset with Student-t weights (ν = 5)."""
     (a, b), (near, far) = pair.intensity, pair.distance2
     x, y = a * (1.0 + f * near), b * (1.0 + f * far)
     basis, w = np.column_stack([x, np.ones(len(x))]), np.ones(len(x))

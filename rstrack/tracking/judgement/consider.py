@@ -25,6 +25,13 @@ from rstrack.keyframes.keyframe import Points, Reference, strides
 
 # Points nearer than this are left out, m; and about so many are enough.
 NEAR, _POINTS = 0.05, 400
+COUNT = len(CALIBRATION_NAMES)
+# Keyframes whose landmarks are remembered.
+_REMEMBERED = 4
+_DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 5), slice(5, 10), slice(10, 16)
+_DEPTH_READOUT, _COLOR_READOUT, CLOCK, _SCALE, _INVERSE = range(16, COUNT)
+# Part of what the points see in all directions below which a direction is not seen.
+_LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +78,6 @@ def _slopes(points: Points, shape: tuple[int, int], stride: int) -> FloatArray:
     seen = np.where(z > 0.0, intensity, np.nan)
     dy, dx = np.gradient(seen, stride) if min(shape) > 1 else (np.full(shape, np.nan),) * 2
     return np.nan_to_num(np.stack([dx, dy], axis=-1))
-
-
-COUNT = len(CALIBRATION_NAMES)
-# Keyframes whose landmarks are remembered.
-_REMEMBERED = 4
-_DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 5), slice(5, 10), slice(10, 16)
-_DEPTH_READOUT, _COLOR_READOUT, CLOCK, _SCALE, _INVERSE = range(16, COUNT)
-# Part of what the points see in all directions below which a direction is not seen.
-_LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,7 +123,7 @@ def weighed(
     return Innovation(excess * together, own, _combined([replace(odd, R=own * odd.R), *rest])[0], inflated)
 
 
-def doubt(
+def mixture(
     innovation: Innovation, fresh: Sequence[Observation], state: SplineState, predicted: Prediction,
     considered: Considered | None = None,
 ) -> FloatArray:  # fmt: skip
@@ -151,13 +151,13 @@ def doubt(
 
 
 def disagreement(
-    fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None, usual: float = 1.0
+    fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None, median: float = 1.0
 ) -> FloatArray:  # fmt: skip
     """Covariance (12, 12) that a pose has beyond the filter's which nothing predicts, of the line that is furthest off.
 
     All of its images have a gradient beyond noise where the spline cannot follow. And where they disagree by more
-    than they, the calibration and what is usual explain, either of them may be right: each counts as if it were.
-    usual: see `Systematic.usual_inflation`; a wrong camera file makes all frames' images disagree.
+    than they, the calibration and the median inflation explain, either of them may be right: each counts as if it were.
+    median: see `Systematic.median_inflation`; a wrong camera file makes all frames' images disagree.
     """
     aligned = [o for o in fresh if o.is_linearised]
     if not aligned:
@@ -178,7 +178,7 @@ def disagreement(
     apart = np.sum([squared(one.z) for one in seen], axis=0)
     z, R, _ = _combined(seen)
     beyond = max(0.0, 1.0 - len(z) / max(float(z @ np.linalg.solve(R, z)), 1e-12))
-    return np.asarray(beyond * squared(z) + max(0.0, 1.0 - usual / inflation) * apart)
+    return np.asarray(beyond * squared(z) + max(0.0, 1.0 - median / inflation) * apart)
 
 
 def learnt(

@@ -127,8 +127,8 @@ class PoseCovariances:
             to_stamp = from_world @ se3.adjoint(spline.pose(frame.depth.exposure.mid_time))
             at, covariance = own.ref, to_stamp @ own.covariance @ to_stamp.T
             common = from_world @ own.common
-        is_told = self.calibration.sigmas > 0.0
-        shared = common[:, is_told] if is_told.any() else None
+        may_be_wrong = self.calibration.sigmas > 0.0
+        shared = common[:, may_be_wrong] if may_be_wrong.any() else None
         return replace(report, covariance=covariance, drift_world=self.uncertainty.drift_of(at), common=shared)
 
     def _keep(self, index: int, common: FloatArray, velocity: FloatArray, color_late_s: float = 0.0) -> None:

@@ -31,6 +31,10 @@ SYSTEMATIC_PX = 0.01
 _GRID = SYSTEMATIC_PX * 2.0 ** (-0.25 * np.arange(17))
 # Frames that count.
 _MEMORY = 30
+# σ (m, rad) above which a pose is not known; with 10 mm fr1_desk and fr1_rpy are lost for good.
+_WORST = np.array([0.02, np.radians(2.0)])
+# A pose that nothing tells, m and rad.
+_NOWHERE = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 3.0])
 
 
 def of_pixels(sigma_px: float, focal_px: float, depth_m: float) -> FloatArray:
@@ -41,7 +45,7 @@ def of_pixels(sigma_px: float, focal_px: float, depth_m: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Systematic:
-    """What the last frames say: logarithms of the likelihoods (17,) of σ; inflations: see `usual_inflation`."""
+    """What the last frames say: logarithms of the likelihoods (17,) of σ; inflations: see `median_inflation`."""
 
     likelihoods: FloatArray = field(default_factory=lambda: np.zeros(len(_GRID)))
     inflations: tuple[float, ...] = ()
@@ -53,7 +57,7 @@ class Systematic:
         return float(_GRID[np.argmax(first + self.likelihoods)])
 
     @property
-    def usual_inflation(self) -> float:
+    def median_inflation(self) -> float:
         """Median of what makes images agree with each other: a wrong camera file has it large."""
         return median(self.inflations) if self.inflations else 1.0
 
@@ -74,24 +78,18 @@ def _likelihoods(squares: FloatArray, spread: FloatArray) -> FloatArray:
     return np.asarray(-0.5 * (np.log(variances) + squares / variances).sum(axis=1))
 
 
-# σ (m, rad) above which a pose is not known.
-_WORST = np.array([0.02, np.radians(2.0)])
-# A pose that nothing tells, m and rad.
-_NOWHERE = np.array([10.0, 10.0, 10.0, 3.0, 3.0, 3.0])
-
-
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of the newest frame. state (12, 12): the filter's covariance of pose and velocity against its keyframe; doubt
-    (12, 12): what they have beyond it, see `innovation.doubt`.
+    """Of the newest frame. state (12, 12): the filter's covariance of pose and velocity against its keyframe; mixture
+    (12, 12): what they have beyond it, see `innovation.mixture`.
 
     seen (6, 6): what its images say of its pose, the information. drift: for each keyframe by its index the covariance
-    (6, 6) of its pose, as left increments in the world. systematic: what images so far have told of such errors;
+    (6, 6) of its pose, as left increments in the world. systematic: what images so far have shown of such errors;
     calibration: and of the calibration's.
     """
 
     state: FloatArray = field(default_factory=lambda: _lost())
-    doubt: FloatArray = field(default_factory=lambda: np.zeros((12, 12)))
+    mixture: FloatArray = field(default_factory=lambda: np.zeros((12, 12)))
     seen: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     drift: dict[int, FloatArray] = field(default_factory=dict)
     systematic: Systematic = field(default_factory=Systematic)
@@ -100,7 +98,7 @@ class Uncertainty:
     @property
     def pose(self) -> FloatArray:
         """Covariance (6, 6) of the pose against the keyframe."""
-        return np.asarray((self.state + self.doubt)[:6, :6])
+        return np.asarray((self.state + self.mixture)[:6, :6])
 
     def covariance(self, focal_px: float, depth_m: float) -> FloatArray:
         """The same with what is systematic, for a depth camera of such a focal length and things so far away."""
@@ -123,18 +121,18 @@ class Uncertainty:
         """So many seconds later, with what the images then say (6, 6).
 
         accelerations (6,): σ of what the velocity changes by beyond what is known, m/s² and rad/s². rate: σ of the
-        angular rate itself, rad/s, where a gyroscope tells it: it does not wander, as what is told by its changes does.
+        angular rate itself, rad/s, where a gyroscope measures it: it does not drift, as what is known by changes does.
         """
-        updated = _told(self.predicted(seconds, accelerations, rate), slice(0, 6), seen)
-        return replace(self, state=0.5 * (updated + updated.T), seen=seen, doubt=np.zeros((12, 12)))
+        updated = _updated(self.predicted(seconds, accelerations, rate), slice(0, 6), seen)
+        return replace(self, state=0.5 * (updated + updated.T), seen=seen, mixture=np.zeros((12, 12)))
 
     def predicted(self, seconds: float, accelerations: FloatArray = ACCELERATION, rate: float = np.inf) -> FloatArray:
         """The state's covariance (12, 12) so many seconds later, before any image; arguments as in `after`."""
         F = np.eye(12)
         F[:6, 6:] = seconds * np.eye(6)
         gain = np.concatenate([0.5 * seconds**2 * np.eye(6), seconds * np.eye(6)])
-        predicted = F @ (self.state + self.doubt) @ F.T + gain @ np.diag(accelerations**2) @ gain.T
-        return _told(predicted, slice(9, 12), np.eye(3) / rate**2)
+        predicted = F @ (self.state + self.mixture) @ F.T + gain @ np.diag(accelerations**2) @ gain.T
+        return _updated(predicted, slice(9, 12), np.eye(3) / rate**2)
 
     def begun_anew(self) -> Uncertainty:
         """Nothing is known of any pose; of the cameras it is what was."""
@@ -146,7 +144,7 @@ class Uncertainty:
 
     def found_anew(self, seen: FloatArray) -> Uncertainty:
         """Of a frame of which nothing is known but what its images (6, 6) say."""
-        return replace(self, state=_lost(), doubt=np.zeros((12, 12))).after(0.0, seen)
+        return replace(self, state=_lost(), mixture=np.zeros((12, 12))).after(0.0, seen)
 
     def with_keyframe(self, index: int, before: int, T_world_depth: FloatArray, pose: FloatArray) -> Uncertainty:
         """With a keyframe made of a frame at T_world_depth (4, 4), whose covariance was `pose` against another one."""
@@ -159,7 +157,7 @@ class Uncertainty:
         return self.drift.get(index, np.zeros((6, 6)))
 
 
-def _told(P: FloatArray, part: slice, information: FloatArray) -> FloatArray:
+def _updated(P: FloatArray, part: slice, information: FloatArray) -> FloatArray:
     """Covariance P (12, 12) with information (k, k) of a part of the state."""
     # P − P E (H⁻¹ + Eᵀ P E)⁻¹ Eᵀ P without the inverse of H, which may be singular.
     solved = np.linalg.solve(np.eye(len(information)) + information @ P[part, part], information)

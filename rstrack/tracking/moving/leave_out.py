@@ -34,11 +34,13 @@ _LEAST = 2e-3
 # Window over which residuals are averaged, and averages that a resting surface hardly has: of depth in σ, and of the
 # size of intensity's, in σ.
 _WINDOW, _WORST_DEPTH, _WORST_INTENSITY = 5, 1.0, 1.8
-# Steps beyond what was seen that a thing is followed, and the part of what can be told of it that has to stand in free
+# Steps beyond what was seen that a thing is followed, and the part of what is known of it that has to stand in free
 # space.
 _BEYOND_STEPS, _LEAST_SHARE = 6, 0.1
 # Pixels of the grid that edges are given besides.
 _MARGIN = 1
+# Part of what is seen that may move: where more seems to, it is the pose that is wrong.
+_MOST = 0.5
 
 
 def moving(seen: SeenFrom, sigma_depth: float, median_depth: float, sigma_intensity: float) -> Mask:
@@ -70,7 +72,7 @@ def _is_enough(seeds: Mask) -> bool:
     return bool(np.count_nonzero(seeds) >= _LEAST * seeds.size)
 
 
-def untold(seen: SeenFrom, sigma_depth: float, median_depth: float) -> Mask:
+def unseen(seen: SeenFrom, sigma_depth: float, median_depth: float) -> Mask:
     """Pixels (gh, gw) of which the other image says nothing: they fall into its holes, beyond it, or behind what it
     shows."""
     _, least = _scales(seen.z, sigma_depth, median_depth)
@@ -123,7 +125,7 @@ def _mean(values: Grid) -> Grid:
 
 
 def _grown(seeds: Mask, odd: Mask, unknown: Mask, beyond: Mask, z: Grid) -> Mask:
-    """Seeds with what is connected to them on one surface and is odd, or cannot be told.
+    """Seeds with what is connected to them on one surface and is odd, or unknown.
 
     That is so in holes, where something may have been left out, and beyond what was seen: there they are followed for a
     few steps only.
@@ -132,9 +134,9 @@ def _grown(seeds: Mask, odd: Mask, unknown: Mask, beyond: Mask, z: Grid) -> Mask
     # Seeds end at edges as well: from a thing's own rim the surface behind it would be reached.
     open_ = (seeds | np.where(unknown, near | ~beyond, odd)) & ~_edges(z)
     count, labels = cv2.connectedComponents(open_.astype(np.uint8), connectivity=4)
-    told = np.bincount(labels[seeds | ~unknown], minlength=count)
+    visible = np.bincount(labels[seeds | ~unknown], minlength=count)
     own = np.bincount(labels[seeds], minlength=count)
-    kept = own >= np.maximum(1.0, _LEAST_SHARE * told)
+    kept = own >= np.maximum(1.0, _LEAST_SHARE * visible)
     kept[0] = False
     return np.asarray(kept[labels] | seeds)
 
@@ -151,10 +153,6 @@ def _edges(z: Grid) -> Mask:
         else:
             out[:, :-1] |= jump
     return out
-
-
-# Part of what is seen that may move: where more seems to, it is the pose that is wrong.
-_MOST = 0.5
 
 
 @dataclass(frozen=True)
@@ -229,7 +227,7 @@ def _found(
     if color is None and before is not None and before.left_out is not None:
         # Without colours only its place tells, in the keyframe's holes, what was left out of the frame before. That
         # creeps over what rests beside it; with colours it costs more than it gains.
-        came = came | (untold(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
+        came = came | (unseen(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
     return LeftOut(
         without_pixels(e, depth, came, grid_of(depth.exposure.lens)[1]) if came.any() else depth,
         gone if gone.any() else None,

@@ -35,6 +35,12 @@ _HIDDEN_M = 0.15
 # Trials of six points each, how many of the best are made better, in how many rounds, how many that differ are tried,
 # and how many motions are followed to the next image. Seed of the trials; what holds directions that no point tells.
 _TRIALS, _REFINED, _ROUNDS, _APART, _FOLLOWED, _SEED, _HOLD = 300, 12, 6, 4, 3, 0, 1e-3
+# Points across the image, the window in which each is followed (px), and how far (px) following it back may miss it.
+_ACROSS, _WINDOW, _BACK_PX = 40, 15, 1.0
+# How far (px of the colour image) a point may be from where the motion takes it, trials, and confidence in the best.
+_MISS_PX, _COLOR_TRIALS, _CONFIDENCE = 2.0, 500, 0.999
+# The fewest points that tell, and the part of them that has to agree.
+_FEWEST, _MAJORITY = 40, 0.5
 
 
 def averaged(rho: FloatImage) -> FloatImage:
@@ -135,16 +141,8 @@ def goes_elsewhere(off: FloatArray) -> Mask:
     return np.asarray(np.abs(np.nan_to_num(off)) > 1.0)
 
 
-# Points across the image, the window in which each is followed (px), and how far (px) following it back may miss it.
-_ACROSS, _WINDOW, _BACK_PX = 40, 15, 1.0
-# How far (px of the colour image) a point may be from where the motion takes it, trials, and confidence in the best.
-_MISS_PX, _COLOR_TRIALS, _CONFIDENCE = 2.0, 500, 0.999
-# The fewest points that tell, and the part of them that has to agree.
-_FEWEST, _MAJORITY = 40, 0.5
-
-
 def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) -> Mask | None:
-    """Pixels (gh, gw) of the first frame's grid that do not move as most of it does; None where that cannot be told.
+    """Pixels (gh, gw) of the first frame's grid that do not move as most of it does; None where that is not known.
 
     frames: in order; rays (h, w, 2): of the depth camera. Lines are taken to be exposed at once: pixels are asked for,
     not tenths.
@@ -164,17 +162,17 @@ def not_with_most(e: Engine, frames: Sequence[DeviceFrame], rays: FloatArray) ->
         return np.stack([rays[..., 0][pick][known] * z, rays[..., 1][pick][known] * z, z], axis=-1)
 
     if all(frame.colors for frame in frames):
-        told = _by_colors(e, frames, points(rho))
+        found = _by_colors(e, frames, points(rho))
     else:
         later = [e.download(frame.depth.inverse_z, shape) for frame in frames[1:]]
         off = apart(points(averaged(rho)), later, rays, lens.camera)
-        told = np.isfinite(off), goes_elsewhere(off)
-    if told is None:
+        found = np.isfinite(off), goes_elsewhere(off)
+    if found is None:
         return None
-    good, elsewhere = told
+    good, elsewhere = found
     if np.count_nonzero(good) < _FEWEST or np.count_nonzero(good & ~elsewhere) < _MAJORITY * np.count_nonzero(good):
         return None
-    # +1: goes another way, -1: with most, 0: not known, to be told by those about it.
+    # +1: goes another way, -1: with most, 0: not known, to be filled in from those about it.
     cells = np.zeros(known.shape, np.float32)
     cells[known] = np.where(good, np.where(elsewhere, 1.0, -1.0), 0.0)
     odd = np.where(cells == 0.0, cv2.blur(cells, (3, 3)), cells + 0.25 * cv2.blur(cells, (3, 3))) > 0.0

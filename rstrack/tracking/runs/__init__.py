@@ -1,1 +1,1 @@
-"""A run of a tracker over a recording: into a folder, resumed, told."""
+"""A run of a tracker over a recording: into a folder, and resumed."""

@@ -23,6 +23,7 @@ from rsgen.files import atomic_write, write_error
 from rsgen.inputs import check_input
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO
+from rstrack.keyframes.archive import Archive
 from rstrack.tracking.loop_tracker import LoopTracker
 from rstrack.tracking.runs.record import Done
 from rstrack.tracking.spline_tracker import Tracker
@@ -61,7 +62,7 @@ def checkpoint_of(
     key: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(options)}
     key |= {f"noise {name}": value for name, value in noise.items()}
     key |= {
-        "dataset": dataset.name, "frames": [chosen.start, chosen.stop], "backend": tracker.engine.backend,
+        "dataset": dataset.name, "frames": [chosen.start, chosen.stop], "backend": _engine(tracker).backend,
         "cameras": f"{depth} {color} {rig.T_color_depth.tolist()} {dataset.depth_error}",
         "clocks": [float(dataset.stamps.sum()), float(dataset.color_stamps.sum())],
         "version": version("rolling-shutter-rgbd"),
@@ -82,10 +83,14 @@ class Checkpoint:
     problem: str = ""
     _due: float = field(default_factory=lambda: time.monotonic() + _EVERY_S)
 
+    @property
+    def _archive(self) -> Archive:
+        return self.tracker.uncorrected.track.keyframes.archive
+
     def begin(self) -> Done:
         """Take away what an earlier run has left; keyframes' files are here from now on."""
         shutil.rmtree(self.root, ignore_errors=True)
-        self.tracker.archive.images.put_in(self.root)
+        self._archive.images.put_in(self.root)
         return Done()
 
     def save_when_due(self, done: Done) -> None:
@@ -108,7 +113,7 @@ class Checkpoint:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise write_error(self.root, error) from None
-        self.tracker.archive.images.write()
+        self._archive.images.write()
         stream = io.BytesIO()
         _Writer(stream, self.tracker).dump({"key": dict(self.key), "done": done, "tracker": self.tracker.state})
         data = stream.getvalue()
@@ -143,7 +148,7 @@ class Checkpoint:
                     "track without --resume"
                 )
         self.tracker.state = state
-        self.tracker.archive.images.put_in(self.root)
+        self._archive.images.put_in(self.root)
         return done
 
     def remove(self) -> None:
@@ -155,7 +160,7 @@ class _Writer(pickle.Pickler):
     def __init__(self, stream: io.BytesIO, tracker: Tracker | LoopTracker) -> None:
         super().__init__(stream, protocol=5)
         self._names = {id(part): name for name, part in _shared(tracker).items()}
-        self._arrays = _array_types(tracker.engine)
+        self._arrays = _array_types(_engine(tracker))
 
     def persistent_id(self, obj: Any) -> str | None:
         return self._names.get(id(obj))
@@ -169,7 +174,7 @@ class _Writer(pickle.Pickler):
 class _Reader(pickle.Unpickler):
     def __init__(self, stream: io.BytesIO, tracker: Tracker | LoopTracker) -> None:
         super().__init__(stream)
-        self._parts, self._engine = _shared(tracker), tracker.engine
+        self._parts, self._engine = _shared(tracker), _engine(tracker)
 
     def persistent_load(self, pid: str) -> Any:
         return self._parts[pid]
@@ -208,8 +213,12 @@ class _Array:
     """Stands for a device array of a kind."""
 
 
+def _engine(tracker: Tracker | LoopTracker) -> Engine:
+    return tracker.uncorrected.track.device.e
+
+
 def _shared(tracker: Tracker | LoopTracker) -> dict[str, Any]:
-    return {"tracker": tracker} | tracker.shared
+    return {"tracker": tracker} | tracker.uncorrected.track.shared
 
 
 def _array_types(e: Engine) -> dict[Any, str]:

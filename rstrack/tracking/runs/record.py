@@ -5,21 +5,31 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
+from rstrack.data.rig import Frame
 from rstrack.data.timing import Timing
+from rstrack.inertial import estimate as inertial_estimate
 from rstrack.options import Options
+from rstrack.tracking.any_tracker import AnyTracker
 from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.runs.segments import Segments
+
+if TYPE_CHECKING:
+    from rstrack.tracking.loop_closing import Closing
+    from rstrack.tracking.runs.checkpoint import Checkpoint
 
 End = Literal["done", "interrupted", "broke down"]
+# Reads a frame by its number; None where its depth cannot be read, and what is wrong with its images.
+Load = Callable[[int], tuple[Frame | None, tuple[str, ...]]]
 
 # Observability (see FrameReport) below which a motion is held by the prior rather than by depth.
 _WEAK = 5e-4
@@ -43,6 +53,48 @@ class Done:
     seconds: list[float] = field(default_factory=list)
     fed: list[int] = field(default_factory=list)
     unreadable: list[tuple[int, str]] = field(default_factory=list)
+
+
+@dataclass
+class Run:
+    """A run before its first frame, or where it was stopped. dataset: with what a first look has found of its colours.
+
+    load: reads frames, with noise added. segments: of a camera that is lost. checkpoint: None where none can be made.
+    """
+
+    dataset: Dataset
+    chosen: range
+    noise: Noise
+    tracker: AnyTracker
+    load: Load
+    segments: Segments
+    checkpoint: Checkpoint | None
+    done: Done
+
+
+def run_info(run: Run, closing: Closing | None, times: dict[str, float]) -> dict[str, Any]:
+    """What run.json holds, but for how the run ended."""
+    done, tracker, found = run.done, run.tracker, run.tracker.uncorrected
+    reports = run.segments.reports(tracker.reports, run.segments.joined(Estimate(*found.trajectory)))
+    spread = 1.0 if closing is None or closing.closed is None else closing.closed.spread
+    info = settings(run.dataset, run.chosen, tracker.options, run.noise) | {
+        "keyframes": tracker.keyframes,
+        "checkpoint_error": (run.checkpoint.problem if run.checkpoint is not None else "") or None,
+        "unreadable": [{"frame": k, "error": problem} for k, problem in done.unreadable],
+        "lost": sum(report.lost for report in reports),
+        "segments": run.segments.info(),
+        "loops": None if closing is None else closing.info(),
+        "spline_valid": tracker.spline_valid,
+        "timings": timings(done.seconds) | times | ({} if closing is None else {"loops_s": closing.seconds}),
+        "frames": diagnostics(run.dataset, done.fed, reports, spread),
+    }
+    if run.dataset.timing is not None:
+        info["clocks"] = run.dataset.timing.as_dict()
+    if found.color_late[1] > 0.0:
+        info["color_late"] = dict(zip(("seconds", "sigma_s"), found.color_late, strict=True))
+    if found.inertia is not None:
+        info["imu"] = inertial_estimate.record(found.inertia)
+    return info
 
 
 def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) -> dict[str, Any]:

@@ -13,9 +13,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -31,18 +30,16 @@ from rstrack.inertial import estimate as inertial_estimate
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 from rstrack.tracking.first_look import looked_at
-from rstrack.tracking.runs.record import Done, End, Noise, Result, diagnostics, keyframes_text, settings, timings
-from rstrack.tracking.runs.segments import Segments, segments_beside
+from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.loop_closing import Closing, close_loops
+from rstrack.tracking.loop_tracker import LoopTracker
+from rstrack.tracking.runs.checkpoint import checkpoint_of
+from rstrack.tracking.runs.record import Done, End, Noise, Result, Run, keyframes_text, run_info
+from rstrack.tracking.runs.segments import segments_beside
+from rstrack.tracking.spline_tracker import Tracker
 
-if TYPE_CHECKING:
-    from rstrack.tracking.frame_report import FrameReport
-    from rstrack.tracking.loop_closing import Closing
-    from rstrack.tracking.runs.checkpoint import Checkpoint
-
-# Reads a frame by its number; None where its depth cannot be read, and what is wrong with its images.
-Load = Callable[[int], tuple[Frame | None, tuple[str, ...]]]
 # Called with each frame that was fed: its number among these, the frame, what became of it, and the tracker.
-Watch = Callable[[int, Frame, "FrameReport", AnyTracker], None]
+Watch = Callable[[int, Frame, FrameReport, AnyTracker], None]
 # A few words on stamps (n,) and poses T_world_depth (n, 4, 4) so far, for the progress line.
 Note = Callable[[FloatArray, FloatArray], str]
 
@@ -80,23 +77,6 @@ def track(
 # -- prepare ----------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Run:
-    """A run before its first frame, or where it was stopped. dataset: with what a first look has told of its colours.
-
-    load: reads frames, with noise added. segments: of a camera that is lost. checkpoint: None where none can be made.
-    """
-
-    dataset: Dataset
-    chosen: range
-    noise: Noise
-    tracker: AnyTracker
-    load: Load
-    segments: Segments
-    checkpoint: Checkpoint | None
-    done: Done
-
-
 def prepare(
     dataset: Dataset, chosen: range, options: Options, out: Path, noise: Noise, resume: bool, gravity: bool
 ) -> Run:  # fmt: skip
@@ -123,8 +103,6 @@ def prepare(
     interval_s, imu = dataset.interval_s(chosen), dataset.imu if options.inertial else None
     tracker = make_tracker(dataset.rig, options, load=again, interval_s=interval_s, imu=imu)
     segments = segments_beside(tracker, dataset.rig, options, again, interval_s, imu)
-    from rstrack.tracking.runs.checkpoint import checkpoint_of  # this imports Dr.Jit
-
     _make_folder(out)
     checkpoint = checkpoint_of(out, dataset, chosen, tracker, dataclasses.asdict(noise))
     if resume and checkpoint is None:
@@ -232,7 +210,7 @@ def finish(run: Run, end: End, error: str, start_s: float, gravity: bool, progre
     if run.checkpoint is not None and end == "interrupted" and not run.segments.begun:
         run.checkpoint.save(run.done)
     times = {"total_s": run.done.total_s + time.perf_counter() - begin, "start_s": start_s}
-    info = _info(run, closing, times) | {"end": end, "error": error or None}
+    info = run_info(run, closing, times) | {"end": end, "error": error or None}
     found = tracker.uncorrected
     down = np.array(info["imu"]["gravity"]) if gravity and found.inertia is not None else None
     if down is not None:
@@ -256,31 +234,6 @@ def finish(run: Run, end: End, error: str, start_s: float, gravity: bool, progre
     )  # fmt: skip
 
 
-def _info(run: Run, closing: Closing | None, times: dict[str, float]) -> dict[str, Any]:
-    """What run.json holds, but for how the run ended."""
-    done, tracker, found = run.done, run.tracker, run.tracker.uncorrected
-    reports = run.segments.told(tracker.reports, run.segments.joined(Estimate(*found.trajectory)))
-    spread = 1.0 if closing is None or closing.closed is None else closing.closed.spread
-    info = settings(run.dataset, run.chosen, tracker.options, run.noise) | {
-        "keyframes": tracker.keyframes,
-        "checkpoint_error": (run.checkpoint.problem if run.checkpoint is not None else "") or None,
-        "unreadable": [{"frame": k, "error": problem} for k, problem in done.unreadable],
-        "lost": sum(report.lost for report in reports),
-        "segments": run.segments.info(),
-        "loops": None if closing is None else closing.info(),
-        "spline_valid": tracker.spline_valid,
-        "timings": timings(done.seconds) | times | ({} if closing is None else {"loops_s": closing.seconds}),
-        "frames": diagnostics(run.dataset, done.fed, reports, spread),
-    }
-    if run.dataset.timing is not None:
-        info["clocks"] = run.dataset.timing.as_dict()
-    if found.color_late[1] > 0.0:
-        info["color_late"] = dict(zip(("seconds", "sigma_s"), found.color_late, strict=True))
-    if found.inertia is not None:
-        info["imu"] = inertial_estimate.record(found.inertia)
-    return info
-
-
 def _imu_text(run: Run, info: dict[str, Any]) -> str:
     if "imu" not in info:
         return ""
@@ -290,10 +243,6 @@ def _imu_text(run: Run, info: dict[str, Any]) -> str:
 
 def _closed(run: Run, end: End, progress: Progress) -> tuple[Closing | None, End]:
     """What became of loops, where they were asked for; how the run ends after it."""
-    from rstrack.tracking.loop_closing import close_loops
-    from rstrack.tracking.loop_tracker import LoopTracker
-    from rstrack.tracking.spline_tracker import Tracker
-
     tracker = run.tracker
     try:
         if isinstance(tracker, LoopTracker):

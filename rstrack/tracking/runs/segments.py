@@ -158,15 +158,15 @@ class Segments:
             T_world_depth = np.concatenate([T_world_depth, poses])[order]
         return Estimate(stamps, T_world_depth, track.spline, track.info)
 
-    def told(self, reports: Sequence[FrameReport], track: Estimate) -> list[FrameReport]:
+    def reports(self, reports: Sequence[FrameReport], track: Estimate) -> list[FrameReport]:
         """The first track's reports, with those of segments of frames that it has lost. track: `joined`."""
-        told = {r.stamp: r for r in reports}
+        found = {r.stamp: r for r in reports}
         for k, segment in enumerate(self.found, 1):
             for t in segment.stamps.tolist():
-                if told[t].lost:
-                    found = segment.report(t, told, track) if segment.is_tied else told[t]
-                    told[t] = replace(found, segment=k, keyframe=False)
-        return list(told.values())
+                if found[t].lost:
+                    own = segment.report(t, found, track) if segment.is_tied else found[t]
+                    found[t] = replace(own, segment=k, keyframe=False)
+        return list(found.values())
 
     def info(self) -> list[dict[str, Any]]:
         """For run.json: of each segment its number of poses, and stamps, s: of the first, the last, the first tie."""

@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from shaken_recording import OPTIONS, SHORT
+from shaken_recording import told as told_wrongly
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.camera_file import camera_content, read_rig
+from rstrack.data.dataset import Dataset
 from rstrack.data.rig import (
     CALIBRATION_NAMES,
     DEFAULT_SIGMA,
@@ -27,7 +30,9 @@ from rstrack.data.rig import (
     Rig,
 )
 from rstrack.options import Options
+from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
 from rstrack.tracking.judgement.consider import CLOCK, COUNT
+from rstrack.tracking.runs.run import track
 from rstrack.tracking.spline_tracker import Tracker
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
@@ -110,9 +115,9 @@ def test_a_wrong_camera_moves_poses_as_the_model_says(name: str, by: float, meth
 def test_colours_that_are_late_are_so_by_how_far_the_camera_moves_meanwhile() -> None:
     """Of one image: a camera that moves as the keyframe's did sees nothing odd, another is off by the difference."""
     tracker = tracked(replace(RIG, sigma=UNIT))
-    track = tracker._track
-    calibration, common = track.covariances.calibration, track.covariances.common
-    window, ref = track.known()
+    covariances = tracker.track.covariances
+    calibration, common = covariances.calibration, covariances.common
+    window, ref = tracker.track.known()
     (color,) = [o for o in window.active if not o.is_depth and o.ref.index == ref.index][-1:]
     _, velocity = window.spline.pose_and_velocity(color.image.exposure.mid_time)
     relative = se3.inverse(window.spline.pose(color.image.exposure.mid_time)) @ ref.T_world_base
@@ -127,7 +132,7 @@ def test_colours_that_are_late_are_so_by_how_far_the_camera_moves_meanwhile() ->
 def test_an_exact_camera_file_costs_nothing_and_says_nothing() -> None:
     tracker = tracked(RIG)
     assert all(report.common is None for report in tracker.reports)
-    assert tracker._track.covariances.considered(0.03) is None
+    assert tracker.track.covariances.considered(0.03) is None
 
 
 def test_only_what_may_be_wrong_has_a_column() -> None:
@@ -174,3 +179,40 @@ def test_a_run_keeps_the_sigmas_that_it_went_by(tmp_path: Path) -> None:
 def test_what_no_sigma_is_ends_in_one_line(tmp_path: Path, sigma: str) -> None:
     with pytest.raises(UserError, match=r"camera\.yaml: sigma"):
         read(tmp_path, "", sigma)
+
+
+# -- what a track's images tell of the calibration --------------------------------------------------------------------
+
+
+def test_it_is_the_solution_of_all_frames_at_once() -> None:
+    """Of normal equations with the prior, as if the clock had not been put right after every frame."""
+    rng = np.random.default_rng(5)
+    true, known = rng.normal(size=COUNT), CalibrationErrors()
+    A, b = np.eye(COUNT), np.zeros(COUNT)
+    for _ in range(40):
+        D, root = rng.normal(size=(6, COUNT)), rng.normal(size=(6, 6))
+        R = root @ root.T + np.eye(6)
+        apart = D @ true + np.linalg.cholesky(R) @ rng.normal(size=6)
+        A += D.T @ np.linalg.solve(R, D) / 30.0
+        b += D.T @ np.linalg.solve(R, apart) / 30.0
+        known = known.with_frame(apart - D[:, CLOCK] * known.clock[0], D, R)
+    np.testing.assert_allclose(known.mean, np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(known.covariance, np.linalg.inv(A), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("late_s", [0.006, -0.006])
+def test_a_clock_is_found_while_tracking(shaken: Dataset, tmp_path: Path, late_s: float) -> None:
+    """As far as σ says, though the first keyframes have the old one; what is done with the run later goes by it."""
+    wrong = told_wrongly(shaken, shaken.rig.color_shutter.readout_s, late_s, np.zeros(6))
+    unsure = replace(wrong, rig=replace(wrong.rig, sigma=CalibrationSigma(offset_s=0.015)))
+    found = track(unsure, OPTIONS, tmp_path, SHORT)
+    late = found.estimate.info["color_late"]
+    assert late["seconds"] == pytest.approx(-late_s, abs=min(2e-3, 3.0 * late["sigma_s"])) and late["sigma_s"] < 4e-3
+    assert f"{1e3 * late['seconds']:+.1f} ±" in found.text()
+    again = wrong.as_seen_by(found.estimate.info)
+    np.testing.assert_allclose(again.color_stamps, wrong.color_stamps + late["seconds"], atol=1e-9)
+
+
+def test_a_clock_that_is_exact_stays(shaken: Dataset, tmp_path: Path) -> None:
+    found = track(shaken, OPTIONS, tmp_path, slice(0, 4))
+    assert "color_late" not in found.estimate.info and "while tracking" not in found.text()

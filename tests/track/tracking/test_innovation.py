@@ -14,7 +14,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement import innovation as module
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
-from rstrack.tracking.judgement.innovation import Prediction, disagreement, doubt, learnt, weighed
+from rstrack.tracking.judgement.innovation import Prediction, disagreement, learnt, mixture, weighed
 from rstrack.tracking.judgement.uncertainty import Systematic
 
 HALF = 0.015
@@ -158,9 +158,9 @@ def test_what_all_images_and_the_prediction_have_in_common_explains_nothing() ->
 
 
 def sigmas(images: list[Any], P: np.ndarray) -> np.ndarray:
-    """σ (12,) of `doubt` where the camera was found as predicted; in `steady`'s unknowns."""
+    """σ (12,) of `mixture` where the camera was found as predicted; in `steady`'s unknowns."""
     state, prediction = at_rest()[0], predicted(P)
-    return np.asarray(np.sqrt(np.diag(doubt(weighed(images, state, prediction), images, state, prediction))) * BY)
+    return np.asarray(np.sqrt(np.diag(mixture(weighed(images, state, prediction), images, state, prediction))) * BY)
 
 
 def test_images_that_agree_far_from_the_prediction_leave_open_which_is_wrong() -> None:
@@ -226,7 +226,7 @@ def test_images_that_disagree_as_they_always_do_say_nothing_of_this_frame() -> N
     images, state = [image(True, R, off), image(False, R, -off)], at_rest()[0]
     alone = disagreement(images, state)
     twice = disagreement([image(True, R, 2.0 * off), image(False, R, -2.0 * off)], state)
-    # The inflation that these need is some (2 off)² over their covariances, and is what has been usual.
+    # The inflation that these need is some (2 off)² over their covariances, and is the median.
     inflation = brentq(lambda s: disagreement(images, state, None, s)[1, 1] - 0.5 * alone[1, 1], 1.0, 1e9)
     assert not disagreement(images, state, None, 2.1 * inflation).any()
     assert disagreement(images, state, None, 0.2 * inflation)[1, 1] == pytest.approx(0.9 * alone[1, 1], rel=0.02)
@@ -236,8 +236,8 @@ def test_images_that_disagree_as_they_always_do_say_nothing_of_this_frame() -> N
 def test_inflations_of_predicted_frames_are_learnt() -> None:
     R, P = np.diag(np.full(12, 1e-8)), np.diag(np.full(12, 1e-2))
     off, known = 0.02 * np.eye(12)[1], Systematic()
-    assert known.usual_inflation == 1.0
-    usual = []
+    assert known.median_inflation == 1.0
+    medians = []
     for apart in (0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0):
         images = [image(True, R, apart * off), image(False, R, -apart * off)]
         for o in images:
@@ -245,5 +245,5 @@ def test_inflations_of_predicted_frames_are_learnt() -> None:
         found = weighed(images, at_rest()[0], predicted(P))
         known, errors = learnt(found, known, CalibrationErrors(), 1.0)
         assert not errors.mean.any(), "of an exact calibration"
-        usual.append(known.usual_inflation)
-    assert usual[:5] == [1.0] * 5 and usual[6] == found.own > 1e3  # a median: two of five frames do not move it
+        medians.append(known.median_inflation)
+    assert medians[:5] == [1.0] * 5 and medians[6] == found.own > 1e3  # a median: two of five frames do not move it

@@ -112,14 +112,14 @@ def test_an_image_that_is_gone_costs_the_loops_not_the_track(tracker: Tracker) -
 def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset, tracker: Tracker) -> None:
     truth = dataset.truth
     assert truth is not None and tracker.spline is not None
-    keyframes = tracker.all_keyframes()
+    keyframes = tracker.track.all_keyframes()
     early = keyframes.get(min(keyframes.indices))
-    frame = tracker.upload(FRAMES - 3, dataset.frame(FRAMES - 3))
+    frame = tracker.track.upload_again(FRAMES - 3, dataset.frame(FRAMES - 3))
     mid = frame.depth.exposure.mid_time
     T_true = se3.inverse(truth.pose(early.t)) @ truth.pose(mid)
     start = T_true @ se3.exp(np.array([0.015, -0.01, 0.01, 0.01, -0.01, 0.01]))
     found = align(
-        tracker.terms, tracker.options, frame, early, tracker.spline, start, (2, 1, 0), judge_of(tracker)
+        tracker.track.terms, tracker.options, frame, early, tracker.spline, start, (2, 1, 0), judge_of(tracker)
     )  # fmt: skip
     assert found.fault == ""
     off = np.abs(se3.log(se3.inverse(T_true) @ found.T_ref_cam))
@@ -128,7 +128,7 @@ def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset, trac
     assert (sigma < 0.01).all()
     # Another place is none.
     elsewhere = align(
-        tracker.terms, tracker.options, frame, early, tracker.spline,
+        tracker.track.terms, tracker.options, frame, early, tracker.spline,
         T_true @ se3.exp(np.array([0.6, 0.0, 0.0, 0.0, 0.5, 0.0])), (1, 0), judge_of(tracker),
     )  # fmt: skip
     assert elsewhere.fault
@@ -136,15 +136,15 @@ def test_a_frame_is_aligned_to_a_keyframe_of_another_time(dataset: Dataset, trac
 
 def test_a_frame_whose_depth_and_colour_are_of_two_places_is_found_at_none(dataset: Dataset, tracker: Tracker) -> None:
     assert dataset.truth is not None and tracker.spline is not None
-    keyframes = tracker.all_keyframes()
+    keyframes = tracker.track.all_keyframes()
     early = keyframes.get(min(keyframes.indices))
     own, other = dataset.frame(FRAMES - 3), dataset.frame(FRAMES - 8)
     colors = tuple(replace(a, pixels=b.pixels) for a, b in zip(own.colors, other.colors, strict=True))
-    frame = tracker.upload(FRAMES - 3, replace(own, colors=colors))
+    frame = tracker.track.upload_again(FRAMES - 3, replace(own, colors=colors))
     T_true = se3.inverse(dataset.truth.pose(early.t)) @ dataset.truth.pose(frame.depth.exposure.mid_time)
-    given = tracker.terms, tracker.options, frame, early, tracker.spline, T_true, (1, 0)
+    given = tracker.track.terms, tracker.options, frame, early, tracker.spline, T_true, (1, 0)
     assert align(*given, judge_of(tracker)).fault
-    frame = tracker.upload(FRAMES - 3, own)
+    frame = tracker.track.upload_again(FRAMES - 3, own)
     assert not align(*given[:2], frame, *given[3:], judge_of(tracker)).fault
 
 
@@ -154,7 +154,7 @@ def test_the_search_leaves_what_the_tracker_remembers_of_keyframes(dataset: Data
     assert isinstance(tracker, Tracker)
     for k in range(FRAMES):
         tracker.feed(dataset.frame(k))
-    calibration = tracker.covariances.calibration
+    calibration = tracker.track.covariances.calibration
     before = dict(calibration._landmarks)
     assert before and close_loops(tracker, dataset.frame).loops
     assert calibration._landmarks == before

@@ -65,7 +65,7 @@ def test_it_ends_as_well_as_loops_closed_at_the_end(run: Path, closed_at_end: Pa
 
 
 @pytest.mark.parametrize("memory_gb", [2.0, 1e-9])
-def test_live_it_knows_where_it_is(dataset: Dataset, memory_gb: float) -> None:
+def test_live_it_knows_where_it_is_and_ends_as_a_run_from_files(dataset: Dataset, run: Path, memory_gb: float) -> None:
     """Without files to read again; with images of keyframes in memory, or not even room for one."""
     tracker = make_tracker(dataset.rig, replace(ONLINE, memory_gb=memory_gb))
     assert isinstance(tracker, LoopTracker)
@@ -81,13 +81,6 @@ def test_live_it_knows_where_it_is(dataset: Dataset, memory_gb: float) -> None:
         np.testing.assert_allclose(spline.pose(stamps), T, atol=1e-9)
     corrected, uncorrected = np.sqrt(np.mean(np.square(off[FRAMES // 2 :]), axis=0))
     assert tracker.closing.closed is not None and corrected < 0.8 * uncorrected
-
-
-def test_images_that_were_kept_serve_as_those_of_files_do(dataset: Dataset, run: Path) -> None:
-    tracker = make_tracker(dataset.rig, ONLINE)
-    assert isinstance(tracker, LoopTracker)
-    for frame in frames(dataset):
-        tracker.feed(frame)
     closing = tracker.finished()
     assert closing.moves is not None and len(closing.loops) > 5
     np.testing.assert_allclose(tracker.trajectory[1], read_estimate(run).T_world_depth, atol=2e-8)

@@ -33,7 +33,7 @@ from rstrack.images.device_frame import DeviceRig, untimed, without_pixels
 from rstrack.options import Options
 from rstrack.tracking.moving.leave_out import moving, moving_with
 from rstrack.tracking.moving.majority import not_with_most
-from rstrack.tracking.track import Track
+from rstrack.tracking.track import TrackState
 
 REF_STAMP, STAMP = 0.43, 0.465
 SHAPE = 72, 96
@@ -225,7 +225,7 @@ def recording() -> Recording:
 
 
 def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recording) -> None:
-    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    track = TrackState(recording.rig, Options(backend="llvm"), untimed)
     e, state = track.device.e, SplineState(recording.truth)
     frames = [track.device.upload(k, frame) for k, frame in enumerate(recording.frames)]
     ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
@@ -260,7 +260,7 @@ def test_a_ball_that_passes_is_left_out_of_frame_and_keyframe(recording: Recordi
 
 
 def test_a_keyframe_has_an_older_ones_colours_where_something_moves(recording: Recording) -> None:
-    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    track = TrackState(recording.rig, Options(backend="llvm"), untimed)
     e, truth = track.device.e, recording.truth
     frames = [track.device.upload(k, recording.frames[k]) for k in (0, 5)]
     first, last = (without_pixels(e, f.depth, recording.balls[k], 1) for f, k in zip(frames, (0, 5), strict=True))
@@ -287,7 +287,7 @@ def test_a_keyframe_has_an_older_ones_colours_where_something_moves(recording: R
 
 def test_what_moves_hides_a_little_more_of_colours_than_of_depth(recording: Recording) -> None:
     """By the time of the colour image it has moved: no point is compared with its own edge."""
-    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    track = TrackState(recording.rig, Options(backend="llvm"), untimed)
     e, state = track.device.e, SplineState(recording.truth)
     frames = [track.device.upload(k, frame) for k, frame in enumerate(recording.frames)]
     ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
@@ -305,7 +305,7 @@ def test_what_moves_hides_a_little_more_of_colours_than_of_depth(recording: Reco
 
 
 def test_what_is_told_not_to_look_does_not(recording: Recording) -> None:
-    track = Track(recording.rig, Options(backend="llvm", moving=False), untimed)
+    track = TrackState(recording.rig, Options(backend="llvm", moving=False), untimed)
     frames = [track.device.upload(k, recording.frames[k]) for k in (0, 5)]
     ref = track.maker.rectified(0, frames[0].depth, frames[0].colors, recording.truth, None)
     fresh = track.observe(frames[1], ref)
@@ -317,7 +317,7 @@ def test_what_is_told_not_to_look_does_not(recording: Recording) -> None:
 
 
 def test_a_keyframe_does_without_what_several_frames_see_through(recording: Recording) -> None:
-    track = Track(recording.rig, Options(backend="llvm"), untimed)
+    track = TrackState(recording.rig, Options(backend="llvm"), untimed)
     first = track.device.upload(0, recording.frames[0])
     ref = track.succession.make(first, recording.truth, None)
     gone = np.zeros(SIZE, bool)

@@ -97,8 +97,8 @@ def test_a_frame_that_is_looked_at_again_does_without_it(beside_ball: Run) -> No
     tracker, k = beside_ball.tracker, FRAMES - 1
     assert tracker.left_out.grid(k) is not None
     frame, ball = made(k, RADIUS)
-    again = tracker.upload(k, frame)
-    z = tracker.engine.download(again.depth.z, ball.shape)
+    again = tracker.track.upload_again(k, frame)
+    z = tracker.track.device.e.download(again.depth.z, ball.shape)
     assert (z[ball] == 0.0).mean() > 0.9 and (z[~ball] > 0.0).mean() > 0.85
     small = small_frame(again, RIG, geometric=True)
     assert small.inverse_depth is not None and small.intensity is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,12 +14,14 @@ from rsgen.geometry import se3
 from rstrack.alignment.observation import Scores
 from rstrack.alignment.optimizer import Solved
 from rstrack.images.pyramid import DepthImage
+from rstrack.options import Options
 from rstrack.tracking import matching
 from rstrack.tracking.frame_report import Fault
-from rstrack.tracking.judgement.lost_track import UsualScales
+from rstrack.tracking.judgement.lost_track import RunningScales
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.matching import Match, judge_unpredicted, without_misfits
 from rstrack.tracking.relocalise import Relocaliser, where_led
+from rstrack.tracking.succession import Succession
 
 REF: Any = SimpleNamespace(index=0, pixels=5000, T_world_base=np.eye(4), median_depth=1.0)
 
@@ -49,17 +51,19 @@ def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.Mo
     """Depth alone fits many places: an iPhone's was found 1.5 m and 180 degrees off, shaken ones up to 58 mm."""
     monkeypatch.setattr(matching, "scores", lambda *_: Scores((1.0,) * 3, 1e8 * np.eye(6)))
     monkeypatch.setattr(matching, "disagreement", lambda *_: np.zeros((12, 12)))
-    covariances = SimpleNamespace(uncertainty=Uncertainty(), after=lambda *_: None, considered=lambda _: None)
-    track: Any = SimpleNamespace(covariances=covariances, usual=UsualScales())
+    covariances = SimpleNamespace(
+        uncertainty=Uncertainty(), common=None, after=lambda *_: None, considered=lambda _: None
+    )
+    track: Any = SimpleNamespace(covariances=covariances, scales=RunningScales())
     for whole, says in ((True, Fault.NONE), (False, Fault.MISFIT)):
         given: list[Any] = [None, REF, SimpleNamespace(state=None), None, [seen("depth")], Solved(last_shift=0.0), None]
         assert judge_unpredicted(track, Match(*given, whole)).fault is says
     # Where frames have fitted ten times better it is another place.
-    track.usual.forget()
+    track.scales.reset()
     for _ in range(3):
         better = seen("depth")
         better.lin.next_sigma = 1e-4
-        track.usual.learn([better])
+        track.scales.learn([better])
     worse = seen("depth")
     worse.lin.next_sigma = 3e-3
     given = [None, REF, SimpleNamespace(state=None), None, [worse], Solved(last_shift=0.0), None]
@@ -144,3 +148,27 @@ def test_of_places_that_look_alike_those_count_where_an_imu_led() -> None:
     ranked = [(0, along(0.1)), (1, turned), (2, along(0.1)), (1, along(0.9))]
     assert where_led(along(0.7), places, ranked) == ranked[2:]
     assert where_led(along(-5.0), places, ranked) == []
+
+
+def pixels_of(keyframe: int, pixels: int) -> Any:
+    lin, ref = SimpleNamespace(count=pixels), SimpleNamespace(index=keyframe)
+    return [SimpleNamespace(is_linearised=True, lin=lin, pixels=pixels, ref=ref)]
+
+
+def test_who_comes_back_to_a_keyframe_may_see_half_of_it() -> None:
+    """Regression: all that a lost frame saw where it was found again counted as the whole keyframe.
+
+    None was made then, however little was left of it.
+    """
+    nothing = cast(Any, None)
+    store = cast(Any, SimpleNamespace(use=lambda found: None))
+    succession = Succession(nothing, store, Options(), nothing, nothing)
+    assert [succession.overlap(pixels_of(3, n)) for n in (800, 1000, 600)] == [1.0, 1.0, 0.6]
+    succession._refer_to(cast(Any, SimpleNamespace(index=7)))
+    assert [succession.overlap(pixels_of(7, n)) for n in (500, 400)] == [1.0, pytest.approx(0.8)]
+    succession.use(cast(Any, SimpleNamespace(index=3)), nothing)
+    assert succession.overlap(pixels_of(3, 500)) == 0.5
+    # One that is made again of the same frame, rectified, is another.
+    succession._refer_to(cast(Any, SimpleNamespace(index=3)))
+    assert succession.overlap(pixels_of(3, 500)) == 1.0
+    assert succession.overlap([SimpleNamespace(is_linearised=False)]) == 0.0  # type: ignore[list-item]

@@ -78,7 +78,7 @@ def test_after_half_a_second_a_segment_begins_with_the_last_frames_found_and_end
     joined = made.joined(Estimate(*first_track(lost)))
     assert np.rint(30.0 * joined.stamps).tolist() == [*range(60)]
     np.testing.assert_allclose(joined.T_world_depth, true_poses(joined.stamps), atol=1e-12)
-    told = made.told(reports_of(set(range(60)) - set(lost)), joined)
+    told = made.reports(reports_of(set(range(60)) - set(lost)), joined)
     assert not any(r.lost for r in told)
     assert [k for k, r in enumerate(told) if r.segment] == [*lost]
 
@@ -122,7 +122,7 @@ def test_a_segment_knows_its_errors_and_those_of_the_frame_that_ties_it() -> Non
         twists[index] = step
         moved, by = segments(twists)
         J[index[0], index[1], :, index[2]] = se3.log(se3.inverse(at) @ moved.joined(by).T_world_depth[1]) / step
-    told = made.told(first, made.joined(track))[frame]
+    told = made.reports(first, made.joined(track))[frame]
     assert not told.lost and told.segment == 1
     assert told.covariance is not None and told.drift_world is not None and told.common is not None
     expected = sum(J[k % 2, k // 2] @ f @ f.T @ J[k % 2, k // 2].T for k, f in enumerate(factors))
@@ -148,7 +148,7 @@ def test_without_a_frame_in_common_nobody_knows_where_a_segment_lies(tmp_path: P
         assert [one.is_tied for one in made.found] == [False]
         own = Estimate(*first_track(lost), None, {"segments": made.info()})
         np.testing.assert_array_equal(made.joined(own).T_world_depth, own.T_world_depth)
-        reports = made.told(reports_of(set()), own)
+        reports = made.reports(reports_of(set()), own)
         assert all(r.lost for r in reports) and reports[30].segment == 1 and reports[5].segment == 0
         made.write(tmp_path)
         poses = read_trajectory(tmp_path / SEGMENTS / "1.txt", format="tum")
@@ -179,7 +179,7 @@ def test_where_a_tied_segment_is_lost_the_next_one_is_tied_to_it() -> None:
     joined = made.joined(Estimate(*first_track(range(10, 60))))
     assert np.rint(30.0 * joined.stamps).tolist() == [*range(60)]
     np.testing.assert_allclose(joined.T_world_depth, true_poses(joined.stamps), atol=1e-12)
-    assert [r.segment for r in made.told(reports, joined)] == [*[0] * 10, *[1] * 20, *[2] * 30]
+    assert [r.segment for r in made.reports(reports, joined)] == [*[0] * 10, *[1] * 20, *[2] * 30]
 
 
 def test_short_losses_and_tracks_that_never_began_have_none() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ ROLLING, GLOBAL = Shutter(readout_s=0.028), Shutter()
 TRUTH = synthetic.make_spline(0.3)
 
 
+@cache
 def frame_at(k: int, shutter: Shutter = ROLLING) -> Frame:
     stamp = k / 30.0
     depth = synthetic.render_depth(TRUTH, CAMERA, shutter, stamp)
@@ -103,8 +105,8 @@ def test_holding_only_the_end_of_the_spline_changes_no_bit(method: Method, monke
     kept = feed(tracker_of(method), frames)
     monkeypatch.setattr("rstrack.tracking.window._RELEASED", 1)
     released = feed(tracker_of(method), frames)
-    assert kept._track.window is not None and released._track.window is not None
-    assert kept._track.window.state.first == 0 < 12 < released._track.window.state.first
+    assert kept.track.window is not None and released.track.window is not None
+    assert kept.track.window.state.first == 0 < 12 < released.track.window.state.first
     # Poses are evaluated in other batches, which rounds otherwise.
     for a, b in zip(kept.trajectory, released.trajectory, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
@@ -155,11 +157,11 @@ def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
 def test_first_frames_that_slide_are_lost_and_the_next_ones_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: a track that began before a bare wall went on from a keyframe that was bent, without a word."""
     tracker, forgotten = tracker_of("rs-g"), []
-    monkeypatch.setattr(tracker._track.usual, "forget", lambda: forgotten.append(True))
+    monkeypatch.setattr(tracker.track.scales, "reset", lambda: forgotten.append(True))
 
     monkeypatch.setattr(bootstrap, "disagreement", lambda *_: np.eye(12) * (not forgotten))
     feed(tracker, (frame_at(k) for k in range(14)))
-    assert forgotten == [True], "what was usual in them"
+    assert forgotten == [True], "their scales"
     assert [report.fault for report in tracker.reports[:6]] == [*[Fault.NO_START] * 5, Fault.NONE]
     assert lost(tracker) == [0, 1, 2, 3, 4] and tracker.keyframes >= 1 and worst_step(tracker) < 3e-3
 
@@ -201,7 +203,7 @@ def test_the_newest_frame_serves_as_a_rolling_reference_until_it_is_rectified(me
     rolling = []
     for k in range(24):
         tracker.feed(frame_at(k))
-        ref = tracker._track.succession.reference
+        ref = tracker.track.succession.reference
         assert ref is not None
         rolling.append(ref.rolling is not None)
     # After the start: rolling for some frames, then rectified, and so on; a keyframe each time.

@@ -58,11 +58,11 @@ def test_what_the_corners_lose_is_found_whatever_the_gain(
     """As little as the prior draws an estimate whose σ is a third of it, and not at all without the systematic part."""
     dark = replace(shaken, images=Darkened(shaken, corner))
     found = estimate_vignetting(dark, true_path(shaken))
-    assert found.falloff == pytest.approx(0.9 * corner + 0.1 * 0.15, abs=5e-3) and 0.04 < found.sigma < 0.055
+    assert found.strength == pytest.approx(0.9 * corner + 0.1 * 0.15, abs=5e-3) and 0.04 < found.sigma < 0.055
     assert found.pairs > 10 and "% darker" in found.text() and "pairs of images" in found.text()
     monkeypatch.setattr(vignetting, "_SYSTEMATIC", 1e-3)
     found = estimate_vignetting(dark, true_path(shaken))
-    assert found.falloff == pytest.approx(corner, abs=4e-3) and found.sigma < 5e-3
+    assert found.strength == pytest.approx(corner, abs=4e-3) and found.sigma < 5e-3
 
 
 def test_the_law_of_a_lens_is_near_enough(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,15 +71,15 @@ def test_the_law_of_a_lens_is_near_enough(shaken: Dataset, monkeypatch: pytest.M
     monkeypatch.setattr(vignetting, "_SYSTEMATIC", 1e-3)
     found = estimate_vignetting(replace(shaken, images=Darkened(shaken, corner, 2.0 / 2.2)), true_path(shaken))
     d2 = corner_distance2(160, 120)
-    np.testing.assert_allclose((1.0 + found.falloff * d2) * (1.0 + corner * d2) ** (-2.0 / 2.2), 1.0, atol=0.01)
+    np.testing.assert_allclose((1.0 + found.strength * d2) * (1.0 + corner * d2) ** (-2.0 / 2.2), 1.0, atol=0.01)
 
 
 def test_even_images_stay_about_as_they_are(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     found = estimate_vignetting(shaken, true_path(shaken))
-    assert 0.0 <= found.falloff < 0.02 and found.sigma < 0.055
+    assert 0.0 <= found.strength < 0.02 and found.sigma < 0.055
     monkeypatch.setattr(vignetting, "_SYSTEMATIC", 1e-3)
     brighter = replace(shaken, images=Darkened(shaken, -0.1))
-    assert estimate_vignetting(brighter, true_path(shaken)).falloff == 0.0, "no lens does that"
+    assert estimate_vignetting(brighter, true_path(shaken)).strength == 0.0, "no lens does that"
 
 
 def test_what_no_motion_shows_is_taken_from_what_lenses_do(shaken: Dataset) -> None:
@@ -87,7 +87,7 @@ def test_what_no_motion_shows_is_taken_from_what_lenses_do(shaken: Dataset) -> N
     for tracks in ([None], true_path(shaken, range(5))):
         found = estimate_vignetting(dark, tracks)
         assert found == Vignetting(0.15, 0.15, 0) and "as lenses do" in found.text()
-    assert estimate_vignetting(dark, [None, *true_path(shaken)]).falloff == pytest.approx(0.285, abs=5e-3)
+    assert estimate_vignetting(dark, [None, *true_path(shaken)]).strength == pytest.approx(0.285, abs=5e-3)
 
 
 class Covered:
@@ -121,7 +121,7 @@ def test_a_kinect_darkens(tmp_path: Path) -> None:
     )
     dataset = open_dataset(RPY, tmp_path / "camera.yaml")
     found = estimate_vignetting(dataset, GeometricTracks(dataset, range(60, 160), Options(), no_progress))
-    assert found.falloff == pytest.approx(0.097, abs=0.02) and found.sigma < 0.055
+    assert found.strength == pytest.approx(0.097, abs=0.02) and found.sigma < 0.055
 
 
 def test_the_tracker_sees_even_images(shaken: Dataset) -> None:
