@@ -16,7 +16,7 @@ from rsgen.config.motion import MotionConfig, TremorConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
-from rsgen.motion.paths import CameraPath, make_path, window
+from rsgen.motion.paths import MotionPath, make_path, window
 from rsgen.motion.statistics import MotionStatistics, motion_statistics
 from rsgen.sequence.trajectory import Trajectory
 
@@ -74,7 +74,7 @@ def least_turning(config: MotionConfig, seed: int) -> float:
     return motion_statistics(trajectory(path.first_size, 0.0)).mean_rotation_deg_s
 
 
-def _parts(config: MotionConfig, seed: int) -> tuple[CameraPath, Callable[[float, float], Trajectory]]:
+def _parts(config: MotionConfig, seed: int) -> tuple[MotionPath, Callable[[float, float], Trajectory]]:
     """The path, and the trajectory of a size and an angle of it, hand-shake included."""
     duration = config.duration_s
     count = math.ceil(duration * RATE_HZ)
@@ -98,7 +98,7 @@ def _parts(config: MotionConfig, seed: int) -> tuple[CameraPath, Callable[[float
 
 
 def _solve(
-    config: MotionConfig, path: CameraPath, measure: Callable[[float, float], MotionStatistics]
+    config: MotionConfig, path: MotionPath, measure: Callable[[float, float], MotionStatistics]
 ) -> tuple[float, float]:
     """Size and angle by turns, each by Brent's method: one round would do, were a tour's turning not up to its size."""
     size, angle = path.first_size, 0.0

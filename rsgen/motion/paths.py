@@ -26,7 +26,7 @@ _MAX_SCALE = 4.0
 
 
 @dataclass(frozen=True)
-class CameraPath:
+class MotionPath:
     """Camera poses over time for a size and an angle, which the targets decide.
 
     poses(size, angle) gives positions (n, 3), world, metres, and R_world_cam (n, 3, 3). The length grows with the
@@ -77,13 +77,13 @@ def window(t: FloatArray, duration: float, ramp: float) -> FloatArray:
     return np.asarray(x**3 * (6.0 * x**2 - 15.0 * x + 10.0))
 
 
-def make_path(config: MotionConfig, t: FloatArray) -> CameraPath:
+def make_path(config: MotionConfig, t: FloatArray) -> MotionPath:
     """The config's motion at times t (n,), seconds, from 0 to its duration. Raises UserError."""
     kinds = {"line": _line, "roll": _roll, "tour": _tour}
     return kinds[config.kind](config, t)
 
 
-def _line(config: MotionConfig, t: FloatArray) -> CameraPath:
+def _line(config: MotionConfig, t: FloatArray) -> MotionPath:
     """`size`: length of a stroke. The camera swings sinusoidally along its first x axis and sways by `angle`."""
     start, R = np.asarray(config.position), look_at(config.position, config.target)  # type: ignore[arg-type]
     phase = math.pi * config.strokes * travel(t, config.duration_s, config.ramp_s)
@@ -92,10 +92,10 @@ def _line(config: MotionConfig, t: FloatArray) -> CameraPath:
     def poses(size: float, angle: float) -> tuple[FloatArray, FloatArray]:
         return start + size * along[:, None] * R[:, 0], R @ so3.exp(angle * sway)
 
-    return CameraPath(poses, 0.0, config.length_m / config.strokes, math.inf, _MAX_SWAY)
+    return MotionPath(poses, 0.0, config.length_m / config.strokes, math.inf, _MAX_SWAY)
 
 
-def _roll(config: MotionConfig, t: FloatArray) -> CameraPath:
+def _roll(config: MotionConfig, t: FloatArray) -> MotionPath:
     """`angle`: from the first orientation to the farthest, either way; `size`: from the axis up to the camera.
 
     Like a camera at the end of a lever, whose axis is parallel to its own z: the centre runs on an arc.
@@ -108,10 +108,10 @@ def _roll(config: MotionConfig, t: FloatArray) -> CameraPath:
         lever = np.array([0.0, -size, 0.0])
         return start + (turn @ lever - lever) @ R.T, R @ turn
 
-    return CameraPath(poses, 0.0, 0.1, math.inf, _MAX_ROLL)
+    return MotionPath(poses, 0.0, 0.1, math.inf, _MAX_ROLL)
 
 
-def _tour(config: MotionConfig, t: FloatArray) -> CameraPath:
+def _tour(config: MotionConfig, t: FloatArray) -> MotionPath:
     """`size`: metres along a closed tour, or scale of an open one; `angle`: of the sway."""
     curve = TourCurve.through(config.waypoints, config.closed)
     done, sway = travel(t, config.duration_s, config.ramp_s), _sway(config, t)
@@ -124,8 +124,8 @@ def _tour(config: MotionConfig, t: FloatArray) -> CameraPath:
         return position, look_at(position, target) @ so3.exp(angle * sway)
 
     if config.closed:
-        return CameraPath(poses, 0.0, config.length_m, math.inf, _MAX_SWAY)
-    return CameraPath(poses, 1.0 / _MAX_SCALE, 1.0, _MAX_SCALE, _MAX_SWAY)
+        return MotionPath(poses, 0.0, config.length_m, math.inf, _MAX_SWAY)
+    return MotionPath(poses, 1.0 / _MAX_SCALE, 1.0, _MAX_SCALE, _MAX_SWAY)
 
 
 def _sway(config: MotionConfig, t: FloatArray) -> FloatArray:
