@@ -23,7 +23,7 @@ from rstrack.data.imu.description import (
     read_imu_yaml,
     read_sensor_yaml,
 )
-from rstrack.data.imu.samples import ImuReadings, Layout, check_times, check_units, read_samples, saturated
+from rstrack.data.imu.samples import Layout, RecordedImu, check_times, check_units, read_samples, saturated
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def find_imu(root: Path, given: Path | None = None, meta: dict[str, Any] | None 
     return None
 
 
-def _rate(samples: ImuReadings, known: ImuDescription) -> tuple[float, tuple[str, ...]]:
+def _rate(samples: RecordedImu, known: ImuDescription) -> tuple[float, tuple[str, ...]]:
     """Samples a second, and what there is to say where the description has another number."""
     steps = np.diff(samples.t)
     counted = float(np.rint(steps / np.median(steps)).sum() / (samples.t[-1] - samples.t[0]))

@@ -29,7 +29,7 @@ _SHOWN = 60
 
 
 @dataclass(frozen=True)
-class ImuReadings:
+class RecordedImu:
     """n samples as they stand in a file: t (n,) s, gyro (n, 3) or None, accel (n, 3). numbers (n,): their lines.
 
     stamp_unit_s: seconds of one of the file's stamps.
@@ -47,7 +47,7 @@ class ImuReadings:
         return f"{self.path} line {self.numbers[k]}"
 
 
-def read_samples(path: Path, layout: Layout) -> ImuReadings:
+def read_samples(path: Path, layout: Layout) -> RecordedImu:
     """All samples, which are finite and come in the order of time.
 
     Lines that begin with '#' are comments, and a first one of letters. Raises UserError, one line, naming the line.
@@ -72,7 +72,7 @@ def read_samples(path: Path, layout: Layout) -> ImuReadings:
     unit = _UNITS[layout]
     t = table[:, 0] / round(1.0 / unit)  # a division is rounded once; 1e-9 is no float
     gyro = table[:, 1:4] if layout == "euroc" else None
-    samples = ImuReadings(path, t, gyro, table[:, -3:], np.array(numbers), unit)
+    samples = RecordedImu(path, t, gyro, table[:, -3:], np.array(numbers), unit)
     _check_order(samples)
     return samples
 
@@ -99,7 +99,7 @@ def _row(line: str, layout: Layout) -> int | None:
         return None
 
 
-def _check_order(samples: ImuReadings) -> None:
+def _check_order(samples: RecordedImu) -> None:
     step = np.diff(samples.t)
     wrong = np.flatnonzero(step <= 0.0) + 1
     if not len(wrong):
@@ -133,7 +133,7 @@ _TURN_S, _LIKE = 0.2, (0.6, 1.5)
 _SURE = 6.0
 
 
-def check_units(samples: ImuReadings, gravity: float) -> None:
+def check_units(samples: RecordedImu, gravity: float) -> None:
     """Raises UserError where the accelerometer or the gyroscope has another unit than m/s² and rad/s.
 
     gravity: m/s²; where there is none, only absurd rates show.
@@ -169,7 +169,7 @@ def check_units(samples: ImuReadings, gravity: float) -> None:
         )
 
 
-def check_times(samples: ImuReadings, stamps: FloatArray, offset_s: float) -> tuple[str, ...]:
+def check_times(samples: RecordedImu, stamps: FloatArray, offset_s: float) -> tuple[str, ...]:
     """What there is to say of gaps, rate and reach, a line each. stamps (n,): the images', s; offset_s is added to t.
 
     Raises UserError: no sample at the images' times, or too low a rate.
@@ -208,7 +208,7 @@ def saturated(values: FloatArray, limit: float | None) -> int:
     return 0 if limit is None else int((np.abs(values) >= 0.999 * limit).any(axis=1).sum())
 
 
-def _apart(samples: ImuReadings, first: float, last: float, offset_s: float) -> str:
+def _apart(samples: RecordedImu, first: float, last: float, offset_s: float) -> str:
     """Why no sample lies at the images' times."""
     stored = samples.t / samples.stamp_unit_s
     expected = dict((unit, name) for name, unit in _STAMP_UNITS)[samples.stamp_unit_s]
@@ -230,7 +230,7 @@ def _apart(samples: ImuReadings, first: float, last: float, offset_s: float) -> 
     )
 
 
-def _turning_unit(samples: ImuReadings, gyro: FloatArray) -> tuple[str, float] | None:
+def _turning_unit(samples: RecordedImu, gyro: FloatArray) -> tuple[str, float] | None:
     """The gyroscope's unit, by name and in rad/s, if gravity's turning shows that it is not rad/s."""
     t, f = samples.t, samples.accel
     step = np.clip(np.diff(t), 0.0, 0.1)

@@ -19,7 +19,7 @@ from rsgen.sensors.imu import ImuSamples, imu_csv, simulate_imu
 from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.imu.description import PHONE, of_sequence
-from rstrack.data.imu.samples import ImuReadings, check_units
+from rstrack.data.imu.samples import RecordedImu, check_units
 
 T_IMU_DEPTH = se3.exp(np.array([0.02, -0.01, 0.03, 0.3, -0.2, 1.0]))
 CONFIG = ImuConfig(
@@ -339,7 +339,7 @@ def test_units_are_right_for_every_shipped_motion_and_a_bad_sensor() -> None:
                                         "gyroscope_bias": (0.2, -0.1, 0.1)})  # fmt: skip
         samples: ImuSamples = simulate_imu(swung(4.0 + seed), bad, 0.0, 4.0 + seed, seed)
         for factor in (1.0, 180.0 / np.pi):
-            table = ImuReadings(
+            table = RecordedImu(
                 Path("x"), samples.t, factor * samples.gyro, samples.accel, np.arange(len(samples.t)), 1e-9
             )
             if factor == 1.0:
