@@ -50,12 +50,13 @@ def draw() -> str:
 
 
 def _rows(layers: list[str]) -> list[list[str]]:
-    """Modules of each layer, those beside each other in one row; several layers of one folder are one row."""
+    """Modules of each layer, those beside each other in one row; a folder is where its first part stands."""
     rows: list[list[str]] = []
     for layer in layers:
-        names = list(dict.fromkeys(".".join(part.strip().split(".")[:2]) for part in layer.split("|")))
-        if names not in rows:
-            rows.append(names)
+        names = dict.fromkeys(".".join(part.strip().split(".")[:2]) for part in layer.split("|"))
+        new = [name for name in names if not any(name in row for row in rows)]
+        if new:
+            rows.append(new)
     return rows
 
 
