@@ -127,7 +127,7 @@ class RollingProjection:
 
     def chain(self, ax: Any, ay: Any, az: Any) -> Vector:
         """Total derivative, by a shift of the point in the *base* frame, of a quantity with the derivatives (ax, ay)
-        by the pixel and az by the depth q_z; the line's own change of time is included (DESIGN: total derivative)."""
+        by the pixel and az by the depth q_z; the line's own change of time is included (docs/method.md)."""
         bx, by, bz = self.at.vjp(ax, ay)
         bz = bz + az
         if self.lens.lines > 1:

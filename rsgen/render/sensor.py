@@ -29,7 +29,7 @@ from rsgen.geometry.shutter import Shutter
 
 
 class RollingShutterSensor(mi.Sensor):
-    """Pinhole sensor with distortion whose lines are exposed one after the other (DESIGN: stamp = end of line 0).
+    """Pinhole sensor with distortion whose lines are exposed one after the other (stamp: end of line 0).
 
     Line i of h is exposed over [stamp + i·t_r/h − t_e, stamp + i·t_r/h]; every sample draws its time within its own
     line's window through Mitsuba's shutter. Lines are rows or columns, in the order of `shutter.scan`. Rays start at

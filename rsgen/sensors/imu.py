@@ -66,7 +66,7 @@ def exact_imu(
     """Angular rate ω (n, 3) in rad/s and specific force Rᵀ(a − g) (n, 3) in m/s², in the IMU's frame, without errors.
 
     spline: T_world_body(t). T_imu_body (4, 4): body to IMU coordinates, lever arm included. gravity (3,): m/s² in the
-    world. t (n,): s. Raises UserError for times outside the spline. DESIGN.md section 4: a = R(v̇ + ω × v), with the
+    world. t (n,): s. Raises UserError for times outside the spline. docs/method.md: a = R(v̇ + ω × v), with the
     twist and its derivative taken to the IMU by the constant adjoint of T_imu_body.
     """
     t, gravity = np.asarray(t, dtype=np.float64), np.asarray(gravity, dtype=np.float64)

@@ -21,8 +21,8 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, cross
 from rstrack.alignment.weights import cost, curvature, weight
 
-# Blocks of lines that share one linearisation by the control points: half of a millisecond (DESIGN section 5: eight of
-# 480 lines lose nothing).
+# Blocks of lines that share one linearisation by the control points: half of a millisecond (eight of 480 lines lose
+# nothing).
 BLOCKS = 60
 # Those of an unrectified reference are larger: it is bootstrapping only, and pairs of blocks are many.
 PAIR_BLOCKS = 15

@@ -1,7 +1,7 @@
 """Normal equations of the step, equation (12): per-block 6×6 systems chained to the control points, and solved.
 
 Unknowns are left increments δ_i in se(3): T_i ← exp(δ_i) T_i in the world frame. A block of lines at time t moves by
-η = Σ J_i(t) δ_i over the four control points of its segment (DESIGN section 4), so its 6×6 system becomes 24×24.
+η = Σ J_i(t) δ_i over the four control points of its segment (docs/method.md), so its 6×6 system becomes 24×24.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 
 ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
-"""Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s² (DESIGN section
-5), so it hardly counts where there are data."""
+"""Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s²,
+so it hardly counts where there are data."""
 VELOCITY = np.array([1.5, 1.5, 1.5, 3.0, 3.0, 3.0])
 """And of velocities, m/s and rad/s, where nothing is known."""
 

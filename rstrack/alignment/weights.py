@@ -17,7 +17,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 
-# Degrees of freedom (Kerl, Sturm, Cremers, ICRA 2013; DESIGN section 4).
+# Degrees of freedom (Kerl, Sturm, Cremers, ICRA 2013).
 NU = 5.0
 # Share of a pixel's weight that its curvature keeps at least.
 LEAST_CURVATURE = 0.5

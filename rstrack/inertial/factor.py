@@ -5,7 +5,7 @@
 `BodyMotion` is the motion of the body (the depth camera) with derivatives by some unknowns of its own, `motion` that of
 a spline. `ImuFactor` takes it to the IMU by the adjoint of T_imu_depth, lever arm included. Tracking, refinement and
 calibration take from it the columns of what they estimate, and add biases and scales, which are linear.
-Left increments T ← exp(δ) T throughout, as for the images (DESIGN section 4).
+Left increments T ← exp(δ) T throughout, as for the images (docs/method.md).
 """
 
 from __future__ import annotations

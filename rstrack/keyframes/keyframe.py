@@ -20,7 +20,7 @@ from rstrack.images.pyramid import LEVELS, masked_pyramid
 from rstrack.images.sampling import EDGE, NEAREST
 
 # Pixels of the smallest image of which every second one, in every second row, is enough, and of the largest one:
-# 320×240 and 640×480 lose nothing by that (DESIGN section 5), while 160×120 has none to spare.
+# 320×240 and 640×480 lose nothing by that, while 160×120 has none to spare.
 _SPARE_PX, _PLENTY_PX = 320 * 240, 640 * 480
 THINNED = LEVELS
 """Beside the pyramid's levels: the finest with every second of its pixels, for where a good many err alike."""

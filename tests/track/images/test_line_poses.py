@@ -104,7 +104,7 @@ def test_a_whole_recording_along_one_spline_is_not_remembered() -> None:
 
 
 def test_a_hand_that_jerks_costs_nanometres_where_a_constant_twist_costs_a_micrometre() -> None:
-    # 35 m/s², the most that hands did in DESIGN's recordings, and back within two knots.
+    # 35 m/s², the most that hands did in TUM's recordings, and back within two knots.
     dt, acceleration = 0.025, 35.0
     sway = 0.5 * acceleration * dt**2 * np.cos(0.5 * np.pi * np.arange(24))
     spline = Spline(se3.exp(sway[:, None] * [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.3, dt)
