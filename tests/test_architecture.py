@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -111,6 +112,14 @@ def test_the_tracker_imports_only_what_is_shared() -> None:
             package, _, rest = module.partition(".")
             assert package not in ("mitsuba", "tests", "scenes"), (name(path), module)
             assert package != "rsgen" or rest.split(".")[0] in SHARED or not rest, (name(path), module)
+
+
+def test_no_modules_import_each_other_not_even_for_types() -> None:
+    modules = {name(path).removesuffix(".py").replace("/", "."): path for path in (*SOURCES, *TRACKER, *BENCHMARKS)}
+    modules = {module: path for module, path in modules.items() if not module.endswith("__init__")}
+    graph = {module: set(imports(path)) & set(modules) - {module} for module, path in modules.items()}
+    assert sum(map(len, graph.values())) > 1000
+    tuple(TopologicalSorter(graph).static_order())  # raises CycleError, which names them
 
 
 def test_geometry_imports_numpy_and_scipy_only() -> None:

@@ -23,6 +23,7 @@ from rstrack.bench.definitions import SequenceEntry, StrictModel
 from rstrack.bench.measures.track import track_cell
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
+from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.figures import displacement_px, rms
 from rstrack.calibration.parameters import COLOR_LENS, DRIFT, EXTRINSICS, NAMES, POSES, Parameters
 from rstrack.calibration.result import CameraCalibration
@@ -208,7 +209,7 @@ def crossed_cell(task: Task, progress: Progress) -> Figures:
         raise KeyboardInterrupt
     task.out.mkdir(parents=True, exist_ok=True)
     file = task.out / "camera.yaml"
-    atomic_write(file, found.camera_file().encode())
+    atomic_write(file, camera_file_of(found).encode())
     entry = task.cell.case_entry.model_copy(update={"camera": file.resolve()})
     crossed = replace(task, cell=replace(task.cell, case_entry=entry))
     return track_cell(crossed, progress) | {"calibration_s": found.seconds}

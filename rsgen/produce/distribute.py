@@ -21,8 +21,7 @@ from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry.spline import Spline
-from rsgen.produce.frame_source import FrameSource
-from rsgen.produce.generate import render_shots
+from rsgen.produce.frame_source import FrameSource, render_shots
 from rsgen.produce.parts import engine_versions, mesh_hashes, open_frames, scene_hash
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Setting

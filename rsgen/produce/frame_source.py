@@ -5,7 +5,8 @@ Exposing a frame uses the renderer and belongs into one thread; developing it is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,15 +16,20 @@ from numpy.typing import NDArray
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.cameras import ColorConfig, DepthConfig
 from rsgen.config.sections import TruthConfig
+from rsgen.console.progress import Progress
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Meter, Reading, Setting, apply_color_noise, apply_setting, reading, to_srgb8
 from rsgen.sensors.depth import apply_depth_noise, mixed_depth, register_depth, with_fixed_errors
 from rsgen.sensors.seed import noise_generator
-from rsgen.sequence.format import CLEAN_COLOR
+from rsgen.sequence.format import CLEAN_COLOR, StreamName
 from rsgen.sequence.truth_files import FrameTable
+
+# Written frames that may wait for the disk: bounds memory and how much a kill can lose.
+_WRITE_AHEAD = 4
 
 # Light meters of cameras see no more than this of a picture.
 _METER_WIDTH, _METER_SPP = 64, 4
@@ -203,3 +209,37 @@ def small_camera(camera: Camera, width: int) -> Camera:
     x, y = columns / camera.width, rows / camera.height
     cx, cy = (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5
     return replace(camera, width=columns, height=rows, fx=camera.fx * x, fy=camera.fy * y, cx=cx, cy=cy)
+
+
+def render_shots(
+    writer: SequenceWriter, source: FrameSource, shots: Sequence[tuple[int, StreamName]], progress: Progress
+) -> None:
+    """Render images (frame, stream) in order and write them; noise and encoding go on beside. Raises UserError."""
+    # However this ends, leaving the pool waits for what has been rendered to be written.
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        pending: list[Future[None]] = []
+        for done, (k, stream) in enumerate(shots, 1):
+            shown = writer.shows(stream, k)
+            stamp = float(writer.stamps(stream)[shown])
+            if stream == "color":
+                after = writer.next_color(k)
+                next_stamp = None if after is None else float(writer.stamps("color")[after])
+                settings = (None if frame is None else writer.setting(frame) for frame in (shown, after))
+                shot = source.expose_color(writer.spline, stamp, shown, next_stamp, *settings)
+                pending.append(pool.submit(_write_color, writer, source, k, shot))
+            else:
+                measured = source.expose_depth(writer.spline, stamp, shown)
+                pending.append(pool.submit(_write_depth, writer, source, k, measured))
+            while len(pending) > _WRITE_AHEAD:
+                pending.pop(0).result()
+            progress("frames", done / len(shots), f"frame {k}")
+        for write in pending:
+            write.result()
+
+
+def _write_color(writer: SequenceWriter, source: FrameSource, k: int, shot: ColorShot) -> None:
+    writer.write_color(k, *source.develop_color(shot))
+
+
+def _write_depth(writer: SequenceWriter, source: FrameSource, k: int, shot: DepthShot) -> None:
+    writer.write_depth(k, shot.z, source.develop_depth(shot), shot.ids)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.object_paths import check_objects_clear
-from rsgen.produce.frame_source import ColorShot, DepthShot, FrameSource
+from rsgen.produce.frame_source import FrameSource, render_shots
 from rsgen.produce.parts import (
     TrueMotion,
     engine_versions,
@@ -31,14 +30,12 @@ from rsgen.produce.parts import (
 )
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Reading, Setting, adapt
-from rsgen.sequence.format import STREAMS, StreamName
+from rsgen.sequence.format import STREAMS
 from rsgen.sequence.truth_files import mesh_file
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
 # format: a sequence is whole without it.
 ORIGIN = "origin.yaml"
-# Written frames that may wait for the disk: bounds memory and how much a kill can lose.
-_WRITE_AHEAD = 4
 
 
 def render_sequence(
@@ -88,40 +85,6 @@ def render_sequence(
         raise
     writer.finish()
     return out
-
-
-def render_shots(
-    writer: SequenceWriter, source: FrameSource, shots: Sequence[tuple[int, StreamName]], progress: Progress
-) -> None:
-    """Render images (frame, stream) in order and write them; noise and encoding go on beside. Raises UserError."""
-    # However this ends, leaving the pool waits for what has been rendered to be written.
-    with ThreadPoolExecutor(max_workers=2) as pool:
-        pending: list[Future[None]] = []
-        for done, (k, stream) in enumerate(shots, 1):
-            shown = writer.shows(stream, k)
-            stamp = float(writer.stamps(stream)[shown])
-            if stream == "color":
-                after = writer.next_color(k)
-                next_stamp = None if after is None else float(writer.stamps("color")[after])
-                settings = (None if frame is None else writer.setting(frame) for frame in (shown, after))
-                shot = source.expose_color(writer.spline, stamp, shown, next_stamp, *settings)
-                pending.append(pool.submit(_write_color, writer, source, k, shot))
-            else:
-                measured = source.expose_depth(writer.spline, stamp, shown)
-                pending.append(pool.submit(_write_depth, writer, source, k, measured))
-            while len(pending) > _WRITE_AHEAD:
-                pending.pop(0).result()
-            progress("frames", done / len(shots), f"frame {k}")
-        for write in pending:
-            write.result()
-
-
-def _write_color(writer: SequenceWriter, source: FrameSource, k: int, shot: ColorShot) -> None:
-    writer.write_color(k, *source.develop_color(shot))
-
-
-def _write_depth(writer: SequenceWriter, source: FrameSource, k: int, shot: DepthShot) -> None:
-    writer.write_depth(k, shot.z, source.develop_depth(shot), shot.ids)
 
 
 def automatic_settings(

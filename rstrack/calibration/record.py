@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, read_text
+from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.result import CameraCalibration
 
 CALIBRATION = "calibration.json"
@@ -116,14 +117,19 @@ class CalibrationRecord(_Stored):
         return {name: each for name, each in self.parameters.items() if not each.is_found}
 
 
+def content_of(found: CameraCalibration) -> dict[str, Any]:
+    """What calibration.json holds of a calibration that has just been made."""
+    return found.as_dict() | {"camera_file": camera_file_of(found)}
+
+
 def record_of(found: CameraCalibration) -> CalibrationRecord:
     """The record of a calibration that has just been made."""
-    return CalibrationRecord.model_validate(found.as_dict())
+    return CalibrationRecord.model_validate(content_of(found))
 
 
 def write_record(found: CameraCalibration, path: Path) -> None:
     """Write calibration.json. Raises UserError."""
-    atomic_write(path, (json.dumps(found.as_dict(), indent=2) + "\n").encode())
+    atomic_write(path, (json.dumps(content_of(found), indent=2) + "\n").encode())
 
 
 def read_record(path: Path) -> CalibrationRecord:

@@ -12,7 +12,6 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
-from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.figures import (
     MeanMotion,
     Pace,
@@ -174,7 +173,6 @@ class CameraCalibration:
             "lenses_px": self._lenses_px(),
             "lens_maps": {name: lens_map(old, new, C) for name, old, new, C in self._lenses()},
             "notes": self.notes(), "device": list(self.device_notes),
-            "camera_file": self.camera_file(),
         }  # fmt: skip
 
     def stated_sigmas(self) -> dict[str, float]:
@@ -196,10 +194,6 @@ class CameraCalibration:
             # What depth images seemed to be off by, each as a whole, came with a lens that was wrong.
             found["depth_image"] = 0.0
         return found
-
-    def camera_file(self) -> str:
-        """A camera.yaml that `rstrack track` takes, with 2 σ beside each value."""
-        return camera_file_of(self)
 
     def cameras(self) -> tuple[Camera, Camera]:
         """Depth camera and colour camera, as found."""

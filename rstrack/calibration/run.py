@@ -2,7 +2,7 @@
 
 found = calibrate(open_dataset(Path("recording")))
 print(found.text())
-Path("camera.yaml").write_text(found.camera_file())
+Path("camera.yaml").write_text(camera_file_of(found))
 """
 
 from __future__ import annotations

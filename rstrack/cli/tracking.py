@@ -58,6 +58,7 @@ def track(
     """
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
+    from rstrack.calibration.camera_file import camera_file_of
     from rstrack.calibration.devices import device_named
     from rstrack.calibration.record import CALIBRATION, write_record
     from rstrack.calibration.run import calibrate as run_calibration
@@ -94,7 +95,7 @@ def track(
                 viewer.corrected(result.estimate.T_world_depth)
     (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder
     if found is not None:
-        atomic_write(out / "camera.yaml", found.camera_file().encode())
+        atomic_write(out / "camera.yaml", camera_file_of(found).encode())
         write_record(found, out / CALIBRATION)
         print(found.text())
     errors = add_errors(out, truth, result.estimate, result.online)
@@ -160,8 +161,9 @@ def calibrate(
     """Find a recording's cameras from its images alone: lenses, readouts, clocks, extrinsics, with standard errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
+    from rstrack.calibration.camera_file import camera_file_of
     from rstrack.calibration.devices import device_named
-    from rstrack.calibration.record import record_of
+    from rstrack.calibration.record import content_of, record_of
     from rstrack.calibration.run import calibrate as calibrate_cameras
     from rstrack.calibration.several import check_alike, together
     from rstrack.data.dataset import open_dataset
@@ -201,8 +203,8 @@ def calibrate(
                 break
         found = together(each) if len(each) > 1 and each[-1].solution.finished else each[-1]
     if out is not None:
-        atomic_write(out, found.camera_file().encode())
-    print(dumps(found.as_dict(), indent=2) if json else found.text())
+        atomic_write(out, camera_file_of(found).encode())
+    print(dumps(content_of(found), indent=2) if json else found.text())
     if out is not None and not json:
         print(f"{out}: written (rstrack track {first} --camera {out} --out RUN)")
     if report is not None:

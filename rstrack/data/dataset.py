@@ -28,6 +28,7 @@ from rstrack.data.estimate import INFO
 from rstrack.data.image_files import ImageReader, prefetched
 from rstrack.data.imu.recording import ImuFiles, ImuRecording, ReadImu, find_imu
 from rstrack.data.layouts import LAYOUTS, layout_of
+from rstrack.data.registration import RegisteredImage, Registrar
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Frame, Image, Rig
 from rstrack.data.timing import Timing, stream_timing
 
@@ -262,3 +263,12 @@ def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tu
     owner = np.where(is_later_nearer, later, earlier)
     bounds = np.searchsorted(owner, np.arange(len(depth) + 1))
     return tuple(tuple(range(a, b)) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True))
+
+
+def registered_image(dataset: Dataset, registrar: Registrar, k: int) -> RegisteredImage:
+    """Frame k of a dataset with the colour image whose stamp is nearest, be it half a second off.
+
+    Raises UserError naming an image that is missing, damaged or of a wrong size.
+    """
+    nearest = int(np.argmin(np.abs(dataset.color_stamps - dataset.stamps[k])))
+    return registrar(dataset.depth(k), dataset.images.color(nearest))

@@ -12,7 +12,7 @@ starts b rows later. Where the sensor's geometry is not known, a = 1 and b = 0.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,9 +23,6 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rstrack.data.rig import Rig
-
-if TYPE_CHECKING:
-    from rstrack.data.dataset import Dataset
 
 # Inverse depth is linear in the pixels of a plane: second differences above this share of it are an edge.
 _EDGE = 0.02
@@ -74,15 +71,6 @@ class Registrar:
         values = cv2.remap(color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         is_seen = self._color_camera.contains(np.stack([u, v], axis=-1))
         return RegisteredImage(np.where(is_seen, z, np.float32(0)), np.asarray(values, np.uint8))
-
-
-def registered_image(dataset: Dataset, registrar: Registrar, k: int) -> RegisteredImage:
-    """Frame k of a dataset with the colour image whose stamp is nearest, be it half a second off.
-
-    Raises UserError naming an image that is missing, damaged or of a wrong size.
-    """
-    nearest = int(np.argmin(np.abs(dataset.color_stamps - dataset.stamps[k])))
-    return registrar(dataset.depth(k), dataset.images.color(nearest))
 
 
 def _pixel_map(camera: Camera, p_cam: FloatArray) -> tuple[Float32Array, Float32Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,9 +15,6 @@ from rsgen.geometry import so3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.description import ImuNoise
-
-if TYPE_CHECKING:
-    from rstrack.inertial.inertia import Inertia
 
 SIZE = 12
 """Gyroscope's bias (rad/s), accelerometer's bias, gravity in the world (both m/s²), and the IMU's turn φ (rad, in its
@@ -120,12 +117,6 @@ class ImuEstimate:
         return float(np.linalg.eigvalsh(J @ self.covariance @ J.T)[-1])
 
 
-def record(inertia: Inertia) -> dict[str, Any]:
-    """The estimate at the end, and when it was known (s)."""
-    known = {"usable_s": _known(inertia.usable_s), "gravity_determined_s": _known(inertia.determined_s)}
-    return known | estimate_dict(inertia.estimate, inertia.sigma)
-
-
 def estimate_dict(estimate: ImuEstimate, sigma: FloatArray) -> dict[str, Any]:
     """Gravity in the run's world (m/s²) and the biases (rad/s, m/s²), each with σ; sigma (2,): of readings."""
     sigmas = estimate.sigmas
@@ -153,7 +144,7 @@ def is_contradicted(estimate: ImuEstimate) -> bool:
 
 
 def text(found: dict[str, Any], begin: float, bridged: int) -> str:
-    """One line of `record`; begin: stamp (s) of the run's first frame. bridged: frames whose pose is the IMU's."""
+    """One line of an IMU's record; begin: stamp (s) of the run's first frame. bridged: frames with the IMU's pose."""
     if found["usable_s"] is None:
         return "IMU: it was of no use: too short a track to tell its biases"
     known = found["gravity_determined_s"]
@@ -197,10 +188,6 @@ def _contradiction(found: dict[str, Any]) -> str:
         f"\nIMU: turned by {degrees:.2f}° from where T_imu_depth has it, which the track takes into account; "
         "rstrack calibrate SEQ --free imu writes one that fits"
     )
-
-
-def _known(seconds: float) -> float | None:
-    return seconds if np.isfinite(seconds) else None
 
 
 def _vector(values: list[float]) -> str:

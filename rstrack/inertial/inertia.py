@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from rstrack.alignment.priors import ACCELERATION, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.band import MotionBand
-from rstrack.inertial.estimate import GRAVITY, GYRO, SIZE, ImuEstimate
+from rstrack.inertial.estimate import GRAVITY, GYRO, SIZE, ImuEstimate, estimate_dict
 from rstrack.inertial.residuals import ImuReadings, ImuResiduals, guessed_gravity, reading_sigmas
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 
@@ -67,6 +68,12 @@ class Inertia:
     @state.setter
     def state(self, state: dict[str, object]) -> None:
         vars(self).update(state)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The estimate at the end, and when it was known (s)."""
+        at = {"usable_s": self.usable_s, "gravity_determined_s": self.determined_s}
+        known = {name: seconds if np.isfinite(seconds) else None for name, seconds in at.items()}
+        return known | estimate_dict(self.estimate, self.sigma)
 
     @property
     def is_usable(self) -> bool:

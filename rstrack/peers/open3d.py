@@ -18,9 +18,9 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rstrack.data.dataset import Dataset
+from rstrack.data.dataset import Dataset, registered_image
 from rstrack.data.estimate import Estimate
-from rstrack.data.registration import RegisteredImage, Registrar, registered_image
+from rstrack.data.registration import RegisteredImage, Registrar
 from rstrack.options import PEERS, Options
 from rstrack.peers.peer import chosen_frames, mid_readout_s, run_info, timed_frames
 

@@ -31,10 +31,10 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rstrack.data.dataset import Dataset
+from rstrack.data.dataset import Dataset, registered_image
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
-from rstrack.data.registration import RegisteredImage, Registrar, registered_image
+from rstrack.data.registration import RegisteredImage, Registrar
 from rstrack.options import Options
 from rstrack.peers.peer import chosen_frames, mid_readout_s, run_info, run_logged
 

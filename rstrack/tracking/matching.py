@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation, Scores, scores
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.spline_state import SplineState
@@ -19,35 +18,8 @@ from rstrack.tracking.judgement.lost_track import RunningScales, implausible, is
 from rstrack.tracking.judgement.pose_covariances import PoseCovariances
 from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
-from rstrack.tracking.track import TrackState
+from rstrack.tracking.track import Match, TrackState, gauge_of, is_rolling
 from rstrack.tracking.window import Window
-
-
-@dataclass(eq=False)
-class Match:
-    """A frame aligned to `ref`.
-
-    window: with its pose; predicted: T_world_depth(t) before any image. fresh: what took part; whole: nothing had to be
-    left out for it. left: what moves by itself.
-    """
-
-    frame: DeviceFrame
-    ref: Reference
-    window: Window
-    predicted: Spline
-    fresh: list[Observation]
-    solved: Solved
-    left: LeftOut
-    whole: bool = True
-
-    @property
-    def on_reference(self) -> list[Observation]:
-        """What the frame's images say against `ref`, not against other keyframes."""
-        return [o for o in self.fresh if o.ref.index == self.ref.index]
-
-    def again(self) -> None:
-        """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro."""
-        self.solved = self.window.solve(self.fresh, (0,), _gauge(self.window, self.frame, self.ref), _rolls(self.ref))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +50,8 @@ def match(
             (found.left,) = track.leave_out([new], ref, found.fresh, found.window.state, last)
 
     def solve(stops: Callable[[Sequence[Observation]], bool] | None) -> None:
-        gauge = _gauge(found.window, new, ref)
-        found.solved = found.window.solve(found.fresh, levels, gauge, _rolls(ref), stops, leave_out)
+        gauge = gauge_of(found.window, new, ref)
+        found.solved = found.window.solve(found.fresh, levels, gauge, is_rolling(ref), stops, leave_out)
 
     window = begin()
     found = Match(new, ref, window, window.spline, fresh, Solved(), LeftOut(new.depth))
@@ -102,7 +74,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     """
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
-    mid, rolls = new.depth.exposure.mid_time, _rolls(found.ref)
+    mid, rolls = new.depth.exposure.mid_time, is_rolling(found.ref)
     T_predicted, seconds = found.predicted.pose(mid), new.stamp - track.found.stamps[-1]
     accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
     considered = track.covariances.considered(seconds)
@@ -189,12 +161,3 @@ def without_misfits(fresh: list[Observation], ref: Reference) -> list[Observatio
 
 def _unknown(uncertainty: Uncertainty) -> Fault:
     return Fault.NONE if uncertainty.is_known else Fault.UNKNOWN
-
-
-def _rolls(ref: Reference) -> bool:
-    return ref.rolling is not None
-
-
-def _gauge(window: Window, new: DeviceFrame, ref: Reference) -> Reference | None:
-    """The first keyframe of a global shutter: no other frame tells where it was taken."""
-    return ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
+from rsgen.geometry.spline import Spline
 from rstrack.adjustment.chain import Chain
 from rstrack.alignment.free_space import FreeSpace
 from rstrack.alignment.linearise import Terms
@@ -38,11 +39,47 @@ from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Gains, Succession
 from rstrack.tracking.window import FoundPoses, Window
 
-if TYPE_CHECKING:
-    from rstrack.tracking.matching import Match
-
 # What a track of the same rig and options would make in the same way.
 _MADE_ANEW = "rig", "options", "device", "terms", "maker", "space"
+
+
+@dataclass(eq=False)
+class Match:
+    """A frame aligned to `ref`.
+
+    window: with its pose; predicted: T_world_depth(t) before any image. fresh: what took part; whole: nothing had to be
+    left out for it. left: what moves by itself.
+    """
+
+    frame: DeviceFrame
+    ref: Reference
+    window: Window
+    predicted: Spline
+    fresh: list[Observation]
+    solved: Solved
+    left: LeftOut
+    whole: bool = True
+
+    @property
+    def on_reference(self) -> list[Observation]:
+        """What the frame's images say against `ref`, not against other keyframes."""
+        return [o for o in self.fresh if o.ref.index == self.ref.index]
+
+    def again(self) -> None:
+        """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro."""
+        self.solved = self.window.solve(
+            self.fresh, (0,), gauge_of(self.window, self.frame, self.ref), is_rolling(self.ref)
+        )
+
+
+def is_rolling(ref: Reference) -> bool:
+    """Whether a reference has not been rectified."""
+    return ref.rolling is not None
+
+
+def gauge_of(window: Window, new: DeviceFrame, ref: Reference) -> Reference | None:
+    """The first keyframe of a global shutter: no other frame tells where it was taken."""
+    return ref if not window.is_frozen(ref.t) and new.depth.exposure.lens.lines == 1 else None
 
 
 class TrackState:

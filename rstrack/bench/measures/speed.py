@@ -22,7 +22,8 @@ from rstrack.bench.definitions import StrictModel
 from rstrack.bench.record import Figures
 from rstrack.bench.sequences import Absent
 from rstrack.bench.task import Task, settings_of
-from rstrack.data.registration import Registrar, registered_image
+from rstrack.data.dataset import registered_image
+from rstrack.data.registration import Registrar
 from rstrack.options import PEERS, Peer
 from rstrack.peers.open3d import PeerTracker
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker

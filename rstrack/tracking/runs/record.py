@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,10 +17,10 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.rig import Frame
 from rstrack.data.timing import Timing
-from rstrack.inertial import estimate as inertial_estimate
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker
 from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.runs.done import Done
 from rstrack.tracking.runs.segments import Segments
 
 if TYPE_CHECKING:
@@ -42,17 +42,6 @@ class Noise:
     sigma_depth: float = 0.0
     sigma_intensity: float = 0.0
     seed: int = 0
-
-
-@dataclass
-class Done:
-    """How far a run is: frames that have been looked at, seconds that it took, and what became of the frames."""
-
-    count: int = 0
-    total_s: float = 0.0
-    seconds: list[float] = field(default_factory=list)
-    fed: list[int] = field(default_factory=list)
-    unreadable: list[tuple[int, str]] = field(default_factory=list)
 
 
 @dataclass
@@ -93,7 +82,7 @@ def run_info(run: Run, closing: Closing | None, times: dict[str, float]) -> dict
     if found.color_late[1] > 0.0:
         info["color_late"] = dict(zip(("seconds", "sigma_s"), found.color_late, strict=True))
     if found.inertia is not None:
-        info["imu"] = inertial_estimate.record(found.inertia)
+        info["imu"] = found.inertia.as_dict()
     return info
 
 

@@ -12,6 +12,7 @@ import pytest
 from shaken_recording import FRAMES, OPTIONS, PACE, RATE_HZ, READOUT_S, RESIDUALS, SHORT, recording, shaking, told
 
 from rstrack.calibration import run as calibration_run
+from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.devices import Device, PublishedShutter
 from rstrack.calibration.parameters import (
     COUNT,
@@ -87,7 +88,7 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     solution = Solution(found, free, A, np.zeros((3, COUNT - 1)), 0.0, 1e-3, 1e-2)
     motion = calibration_run.motion_of(shaken, [range(30)], shaking())
     made = CameraCalibration(shaken, start, solution, np.ones(COUNT, bool), (range(30),), motion, 1.0, RESIDUALS, PACE)
-    (tmp_path / "camera.yaml").write_text(made.camera_file())
+    (tmp_path / "camera.yaml").write_text(camera_file_of(made))
     again = open_dataset(shaken.root, tmp_path / "camera.yaml")
     expected = made.calibrated()
     for ours, theirs in zip(
@@ -103,10 +104,10 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     # Stamps are used as they were, whatever 'auto' would make of them.
     clock = stream_timing("depth", shaken.stamps, "regular", 0.0)
     regular = replace(made, dataset=replace(shaken, timing=Timing(clock, clock, 0.0)))
-    assert "\nstamps: regular" in regular.camera_file() and "\nstamps" not in made.camera_file()
+    assert "\nstamps: regular" in camera_file_of(regular) and "\nstamps" not in camera_file_of(made)
     # Of stamps that are arrival times the offset is this recording's alone.
     jittered = replace(clock, clock=replace(clock.clock, verdict="jittered"))
-    arrived = replace(made, dataset=replace(shaken, timing=Timing(jittered, clock, 0.0))).camera_file()
+    arrived = camera_file_of(replace(made, dataset=replace(shaken, timing=Timing(jittered, clock, 0.0))))
     (tmp_path / "clocks.yaml").write_text(arrived)
     own = open_dataset(shaken.root, tmp_path / "clocks.yaml")
     np.testing.assert_allclose(own.color_stamps, expected.color_stamps, atol=2e-7)
@@ -190,4 +191,4 @@ def test_a_device_that_the_recording_contradicts_is_left_out(shaken: Dataset, mo
     assert found.text().count("this recording contradicts the device's") == 2 and found.start.depth_readout_s == 0.0
     for readout_s in (found.values.depth_readout_s, found.values.color_readout_s):
         assert readout_s == pytest.approx(READOUT_S, abs=1e-3)
-    assert "# device: Made up: depth global" in found.camera_file()
+    assert "# device: Made up: depth global" in camera_file_of(found)

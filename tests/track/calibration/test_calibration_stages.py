@@ -11,6 +11,7 @@ import yaml
 from shaken_recording import OPTIONS, READOUT_S, SHORT
 
 from rsgen.array_types import ByteArray, Float32Array
+from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.pairs.window import overcounted
 from rstrack.calibration.parameters import BY_COLOR, COUNT, NAMES, Parameters
 from rstrack.calibration.run import calibrate
@@ -61,7 +62,7 @@ def test_a_lens_is_not_bent_by_depth_that_is_off_in_the_same_way_in_all_images(s
     at_once, in_stages = errors
     assert in_stages < 0.25 * at_once
     assert abs(found.values.color_readout_s - READOUT_S) < 2.0 * found.sigmas[1] < 2e-3
-    told = yaml.safe_load(found.camera_file())
+    told = yaml.safe_load(camera_file_of(found))
     assert told["sigma"]["depth_image"] == 0.0 and told["sigma"]["focal"] > 0.0
 
 

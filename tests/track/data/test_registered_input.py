@@ -12,8 +12,8 @@ import synthetic
 
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.data.dataset import open_dataset
-from rstrack.data.registration import RegisteredImage, Registrar, registered_image
+from rstrack.data.dataset import open_dataset, registered_image
+from rstrack.data.registration import RegisteredImage, Registrar
 from rstrack.data.rig import Rig
 
 GLOBAL = Shutter(0.0)
