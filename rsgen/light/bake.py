@@ -41,7 +41,7 @@ log = logging.getLogger("rsgen")
 
 
 # Raise when the method changes, so that older caches are not taken for new ones.
-METHOD = 8
+METHOD = 9
 _FINE_TEXELS = 0.9  # direct light is computed at points at least about this far apart
 _FIRST_LOOK_TEXELS = 3.0
 _FIRST_LOOK_RAYS = 12

@@ -183,7 +183,8 @@ def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follo
         lit = (cosine > 0) & (ds.pdf > 0) & (dr.max(value) > 0)
         arrives = transmitted(scene, p, ds.d, ds.dist, lit, follow)
         light = value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine))
-        light = in_channels(dr.select(lit, light * arrives, 0), cosine)
+        # What misses a lamp with a picture has no direction: a cosine that is NaN would be in the sum, times 0.
+        light = in_channels(dr.select(lit, light * arrives, 0), dr.select(lit, cosine, 0))
         first = (i & 1) == 0
         even += dr.select(first, light, 0)
         odd += dr.select(first, 0, light)

@@ -67,7 +67,7 @@ def _from_lamps(scene: Any, p_world: FloatArray, follow: bool) -> FloatArray:
     ds, value = scene.sample_emitter_direction(it, r2(index % _LAMP_SAMPLES, mi.Point2f(0.5)), False)
     lit = (ds.pdf > 0) & (dr.max(value) > 0)
     arrives = transmitted(scene, it.p, ds.d, ds.dist, lit, follow)
-    return _projected(dr.select(lit, value * arrives, 0), ds.d, _LAMP_SAMPLES)
+    return _projected(dr.select(lit, value * arrives, 0), dr.select(lit, ds.d, 0), _LAMP_SAMPLES)
 
 
 def _places(p_world: FloatArray, which: Any) -> Any:

@@ -21,14 +21,14 @@ from lit import (
     scene_of,
     silent,
 )
-from rendering import constant_twist, mi
+from rendering import constant_twist, dr, mi
 
 from rsgen.config.config import LightConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import cache as lighting
 from rsgen.light.interpolation import denoised, thin
-from rsgen.light.lamps import left_to_rays, near_lamps
+from rsgen.light.lamps import _draw, left_to_rays, near_lamps
 from rsgen.light.sampling import CHANNELS, PATCH, about_normal, sampled_adaptively, standard_error, visible_error
 from rsgen.light.sky import BINS, Guide, bin_of
 from rsgen.light.surface_points import SamplePoints
@@ -294,3 +294,29 @@ def test_a_glossy_floor_in_a_dim_mirror_is_what_stands_behind_it_dimmed(tmp_path
     seen, behind = images[0][5:11], images[1][5:11, ::-1]  # rows of the floor in the mirror
     assert behind.max() > 3 * behind.min()  # the lamp's reflection among them
     np.testing.assert_allclose(seen.mean(axis=(0, 1)), [0.03, 0.02, 0.01] * behind.mean(axis=(0, 1)), rtol=0.02)
+
+
+class NoPlaceOnIt:
+    """A scene whose lamps are missed by every sample: Mitsuba then leaves a direction that nobody has set."""
+
+    def __init__(self, scene: Any) -> None:
+        self._scene = scene
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._scene, name)
+
+    def sample_emitter_direction(self, it: Any, u: Any, test: bool) -> Any:
+        ds, value = self._scene.sample_emitter_direction(it, u, test)
+        ds.d, ds.pdf = mi.Vector3f(dr.opaque(mi.Float, np.nan)), dr.opaque(mi.Float, 0)
+        return ds, value
+
+
+def test_a_sample_beside_a_lamp_brings_nothing(tmp_path: Path) -> None:
+    # The picture on a lamp may be larger than what its corners show of it. Such samples made points of the office NaN,
+    # other ones in every bake.
+    scene = NoPlaceOnIt(scene_of(tmp_path, FLOOR, QUAD))
+    position = np.float32([[0, 0, 0], [0.5, 0.2, 0]])
+    normal = np.tile(np.float32([0, 0, 1]), (2, 1))
+    points = SamplePoints(position, normal, normal, np.zeros(2, int))
+    found = _draw(scene, None, 0, points, np.arange(2), False)(np.arange(2), 0, 8, silent)
+    np.testing.assert_array_equal(found, np.zeros((2, 2, CHANNELS)))
