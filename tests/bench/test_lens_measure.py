@@ -29,7 +29,6 @@ def found(told: Dataset) -> Any:
     solution = SimpleNamespace(finished=True, covariance=np.eye(COUNT))
     return SimpleNamespace(
         values=parameters_of(told), sigmas=np.ones(COUNT), solution=solution, seconds=3.0, calibrated=lambda: told,
-        camera_file=lambda: CAMERA.replace("24, 24,", "25, 25,"),
     )  # fmt: skip
 
 
@@ -79,6 +78,7 @@ def test_a_recording_is_tracked_with_the_camera_that_another_gave(
         assert told.root == other and told.rig.color_camera.fx == 24.0
         return found(replace(told))
 
+    monkeypatch.setattr(lens, "camera_file_of", lambda _: CAMERA.replace("24, 24,", "25, 25,"))
     monkeypatch.setattr(lens, "track_cell", track_cell)
     monkeypatch.setattr(lens, "calibrate", calibrate)
     task = make_task(root, "rs-pg", settings={"calibrated_on": "other"}, camera=file)
