@@ -17,7 +17,7 @@ from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.estimate import SIZE, TURN, TURNED, ImuEstimate, is_contradicted, record, text
+from rstrack.inertial.estimate import SIZE, TURN, TURNED, ImuEstimate, is_contradicted, text
 from rstrack.inertial.estimate import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.inertia import Inertia
 from rstrack.inertial.residuals import ImuReadings, ImuResiduals
@@ -216,7 +216,7 @@ def test_a_place_that_readings_contradict_is_said() -> None:
     off, right = (learnt(hand_held(2.0, 3), 3, turn=given) for given in (turn, None))
     assert is_contradicted(off.estimate) and not is_contradicted(right.estimate)
     assert np.linalg.norm(off.estimate.mean[TURN] - turn) < np.radians(0.1)
-    said, plain = (text(record(inertia), 0.0, 0) for inertia in (off, right))
+    said, plain = (text(inertia.as_dict(), 0.0, 0) for inertia in (off, right))
     degrees = np.degrees(np.linalg.norm(off.estimate.mean[TURN]))
     assert f"turned by {degrees:.2f}°" in said and "rstrack calibrate SEQ --free imu" in said and "turned" not in plain
 
