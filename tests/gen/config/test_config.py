@@ -11,32 +11,16 @@ from typing import Any
 import fuzzing
 import pytest
 import yaml
+from config_files import MINIMAL, load, refused
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from rsgen.cli.main import main
-from rsgen.config.config import Config, describe_fields, load_config, recorded_config, validate_config
+from rsgen.config.config import describe_fields, load_config, recorded_config, validate_config
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 
-MINIMAL: dict[str, Any] = {"name": "demo", "trajectory": {"file": "t.txt"}, "scene": {"file": "s.xml"}}
 ROTATED = [[0, -1, 0, 0.1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-
-
-def load(folder: Path, data: Any, overrides: dict[str, str] | None = None) -> Config:
-    path = folder / "config.yaml"
-    path.write_text(data if isinstance(data, str) else yaml.safe_dump(data))
-    return load_config(path, overrides)
-
-
-def refused(folder: Path, data: Any, *parts: str, overrides: dict[str, str] | None = None) -> None:
-    with pytest.raises(UserError) as error:
-        load(folder, data, overrides)
-    text = str(error.value)
-    assert "\n" not in text and len(text) < 1000
-    for part in parts:
-        assert part in text, text
 
 
 def test_a_minimal_config_has_the_issues_defaults(tmp_path: Path) -> None:
@@ -381,31 +365,3 @@ def test_a_pixel_that_no_ray_reaches_is_refused(
 
 
 # --- former names -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("old", "now"),
-    [
-        ("declared.color.readout_s", "faults.declared"),
-        ("color.driver.jitter_s", "faults.color"),
-        ("depth.driver", "faults.depth"),
-        ("imu.clock_offset_s", "faults.imu.clock_offset_s"),
-    ],
-)
-def test_a_fault_by_its_former_name_is_told_the_new_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, now: str
-) -> None:
-    refused(tmp_path, MINIMAL, f"{'.'.join(old.split('.')[:2]) if 'declared' not in old else 'declared'}: is now {now}",
-            overrides={old: "1"})  # fmt: skip
-    assert main(["render", "demo", f"--{old}", "1"]) == 2
-    assert f"rsgen: --{old}: is now --{now}" in capsys.readouterr().err
-
-
-def test_a_recorded_config_keeps_its_faults_under_their_former_names(tmp_path: Path) -> None:
-    faults = {"color": {"blackouts": [[1.0, 0.5]]}, "imu": {"dropped": 0.0}, "declared": {"depth": {"readout_s": 0.01}}}
-    config = load(tmp_path, MINIMAL | {"imu": {"preset": "phone"}, "faults": faults})
-    content = config.content()
-    assert "faults" not in content and content["color"]["driver"]["blackouts"] and content["depth"]["driver"] is None
-    assert content["imu"]["jitter_s"] == 5e-5 and content["declared"]["depth"]["readout_s"] == 0.01
-    again = recorded_config(content, "again")
-    assert again.content() == content and again.injected.imu == config.injected.imu  # none of the preset's losses
