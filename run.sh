@@ -62,10 +62,10 @@ demo() {
   .venv/bin/rsgen render demo --out out/demo
   .venv/bin/rsgen verify out/demo
   .venv/bin/rsgen preview out/demo
-  .venv/bin/rsgen compare out/demo --frame 20
+  .venv/bin/rsgen preview out/demo --frame 20
   .venv/bin/rstrack track out/demo --out out/demo_track
   .venv/bin/rstrack track out/demo --out out/demo_track_gs --method gs-pg
-  .venv/bin/rstrack plot out/demo out/demo_track --out out/demo_track/plot.png
+  .venv/bin/rstrack report out/demo_track --out out/demo_track/plot.png
   .venv/bin/rstrack report out/demo_track
   .venv/bin/rstrack evaluate out/demo out/demo_track --against out/demo_track_gs
 }

@@ -67,8 +67,10 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
     figures = {"bake_s": time.perf_counter() - begin, "bake_mb": peak_mb()}
     with straight_through_bulbs(scene):
         estimate = estimated_quality(scene, field, config.light.texel_m, *lines_of_sight(config))
+    motion = load_motion(config)
+    stamps = spread_times(motion.first_stamp, motion.last_stamp, settings["views"])
     views = compare_light(
-        config, settings["views"], settings["spp"], settings["width"], Path(settings["picture"]), progress,
+        config, motion.spline.pose, stamps, settings["spp"], settings["width"], Path(settings["picture"]), progress,
         lit=(scene, BakedIntegrator(field), mi), seed=settings["seed"],
     )  # fmt: skip
     psnr = [view.psnr_db for view in views]
@@ -115,7 +117,7 @@ def time_modes(
     motion = load_motion(config.model_copy(update={"color": timed}))
     scene, baked, mi = lit_scene(config, progress)
     baked.glossy_spp = mirrored_samples(config.light, spp)
-    stamps = spread_times(motion, frames + 1)
+    stamps = spread_times(motion.first_stamp, motion.last_stamp, frames + 1)
     camera = config.color.camera
     chosen = [m for m in _modes(config, scene, baked, mi, motion.spline.pose, spp) if m.name in modes]
     seconds, failed = _measure(chosen, stamps, progress)

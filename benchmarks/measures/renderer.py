@@ -69,7 +69,7 @@ def rendered(task: Task, what: str, settings: Mapping[str, Any], progress: Progr
 
 
 class LightSettings(StrictModel):
-    """As of `rsgen check-light`."""
+    """As of `rsgen verify --light`."""
 
     views: int = Field(default=5, ge=1, description="views, evenly spread over the trajectory")
     spp: int = Field(default=4096, ge=1, description="samples per pixel of the path-traced reference")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,11 @@ from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.spline import Spline
 from rsgen.produce.frame_source import small_camera
-from rsgen.produce.parts import TrueMotion, load_motion, load_scene, make_integrator, mirrored_samples
+from rsgen.produce.parts import load_scene, make_integrator, mirrored_samples
 
+Poses = Callable[[Any], FloatArray]
 PSNR_FLOOR_DB = 36.0
 _REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before
 _REFERENCE_PASS = 64  # samples per pixel of one pass, for progress
@@ -43,24 +46,28 @@ class LightView:
 
 
 def check_light(
-    config: Config, views: int, spp: int, width: int, picture: Path | None, progress: Progress
+    config: Config, spline: Spline, views: int, spp: int, width: int, picture: Path | None, progress: Progress
 ) -> tuple[str, bool]:
-    """`compare_light` as a table, and whether every view is sure to reach PSNR_FLOOR_DB. Raises UserError."""
+    """`compare_light` of views along a spline as a table, and whether every view is sure to reach PSNR_FLOOR_DB.
+
+    Raises UserError.
+    """
     table: list[tuple[str, ...]] = []
-    found = compare_light(config, views, spp, width, picture, progress)
+    stamps = spread_times(spline.t_begin, spline.t_end, views)
+    found = compare_light(config, spline.pose, stamps, spp, width, picture, progress)
     for k, v in enumerate(found):
         numbers = fixed(v.stamp, 2), fixed(v.psnr_db, 1), fixed(v.surely_db, 1), fixed(v.bias_pct, 2, sign="+")
         sure, likely = v.surely_db >= PSNR_FLOOR_DB, v.psnr_db >= PSNR_FLOOR_DB
-        table.append((str(k), *numbers, "yes" if sure else "unsure: more --spp" if likely else "no"))
+        table.append((str(k), *numbers, "yes" if sure else "unsure: more --light-spp" if likely else "no"))
     head = ("view", "time, s", "PSNR, dB", "surely, dB", "bias, %", f"at least {PSNR_FLOOR_DB:g}")
     return Table(head, tuple(table)).text(), min(v.surely_db for v in found) >= PSNR_FLOOR_DB
 
 
 def compare_light(
-    config: Config, views: int, spp: int, width: int, picture: Path | None, progress: Progress,
+    config: Config, pose: Poses, stamps: FloatArray, spp: int, width: int, picture: Path | None, progress: Progress,
     lit: tuple[Any, Any, Any] | None = None, seed: int = 0,
 ) -> list[LightView]:  # fmt: skip
-    """Baked against path-traced global-shutter views, spread evenly over the config's trajectory, `width` pixels wide.
+    """Baked against path-traced global-shutter views, of the poses T_world_depth at `stamps` (s), `width` pixels wide.
 
     Noise is taken out, both pictures': the squared error is the product of two errors, of different samples throughout.
     So is what sRGB's bend makes of the reference's noise (see `_encoded`).
@@ -68,7 +75,6 @@ def compare_light(
     Writes baked, path-traced and eight times their difference as one picture if a path is given. lit: what `lit_scene`
     returns, if it is at hand. seed: of all samples. Raises UserError.
     """
-    motion = load_motion(config)
     scene, baked, mi = lit or lit_scene(config, progress)
     baked.glossy_spp = mirrored_samples(config.light, _BAKED_SPP)
     from rsgen.figures import save_grid
@@ -80,14 +86,16 @@ def compare_light(
     theirs = ColorRenderer(scene, reference, camera, Shutter(), _REFERENCE_PASS)
     found: list[LightView] = []
     rows: list[list[FloatArray]] = []
-    passes, pose = 4 * max(1, round(spp / (4 * _REFERENCE_PASS))), motion.spline.pose
-    for view, stamp in enumerate(spread_times(motion, views)):
+    passes = 4 * max(1, round(spp / (4 * _REFERENCE_PASS)))
+    for view, stamp in enumerate(stamps):
         first_seed = seed * _SEEDS
         mine = [ours.render(pose, float(stamp), first_seed + 2 * view + k).astype(np.float64) for k in (0, 1)]
         quarters = np.zeros((4, *mine[0].shape))
         for k in range(passes):
             quarters[k % 4] += theirs.render(pose, float(stamp), first_seed + 1000 * (view + 1) + k)
-            progress("path tracing", (view * passes + k + 1) / (views * passes), f"view {view + 1} of {views}")
+            progress(
+                "path tracing", (view * passes + k + 1) / (len(stamps) * passes), f"view {view + 1} of {len(stamps)}"
+            )
         ours_linear, whole = (mine[0] + mine[1]) / 2, quarters.sum(axis=0) / passes
         quarters *= (4 / passes) * config.color.exposure_gain
         one, other = _encoded(quarters[::2]), _encoded(quarters[1::2])
@@ -143,11 +151,10 @@ def view_camera(config: Config, width: int) -> Camera:
     """The colour camera with images `width` pixels wide. Raises UserError for more than it has, or less than 8."""
     camera = config.color.camera
     if not 8 <= width <= camera.width:
-        raise UserError(f"--width {width}: choose 8 to {camera.width}")
+        raise UserError(f"--light-width {width}: choose 8 to {camera.width}")
     return small_camera(camera, width)
 
 
-def spread_times(motion: TrueMotion, count: int) -> FloatArray:
-    """`count` instants spread over the recording, its very ends left out."""
-    fraction = (np.arange(count) + 0.5) / count
-    return motion.first_stamp + fraction * (motion.last_stamp - motion.first_stamp)
+def spread_times(begin: float, end: float, count: int) -> FloatArray:
+    """`count` instants spread evenly from begin to end, these left out."""
+    return begin + (np.arange(count) + 0.5) / count * (end - begin)

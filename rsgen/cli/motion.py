@@ -1,4 +1,4 @@
-"""The commands about motions: fit, motion stats, motion suggest."""
+"""The commands about motions: `motion fit`, `motion suggest`, `motion stats`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def fit(
 
 
 def stats(
-    configs: Annotated[list[Path], "YAML files, or names that 'rsgen configs' lists", "config", config_file],
+    configs: Annotated[list[Path], "YAML files, or names that 'rsgen scenes' lists", "config", config_file],
 ) -> int:
     """Print length, mean speeds and accelerations of the configs' motions, a line a config, beside the paper's."""
     from rsgen.config.config import load_config

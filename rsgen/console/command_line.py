@@ -14,7 +14,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
@@ -36,6 +36,13 @@ class Alone:
 
 _METAVARS: dict[Any, str] = {int: "N", float: "X"}
 _NO_MATTER = (None, "", (), False)  # defaults of which help says nothing
+
+
+class _Help(argparse.HelpFormatter):
+    """Wraps each line by itself: examples stay one below the other."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return "\n".join(super(_Help, self)._fill_text(line, width, indent) for line in text.splitlines())
 
 
 class Parser(argparse.ArgumentParser):
@@ -65,7 +72,7 @@ class Commands:
         parser = self._commands.add_parser(name, help=help, description=description)
         return Commands(f"{self.name} {name}", description, parser)
 
-    def add(self, run: Run, example: str, note: str = "") -> argparse.ArgumentParser:
+    def add(self, run: Run, *examples: str, note: str = "") -> argparse.ArgumentParser:
         """The command that `run` declares: its name, its docstring as help, an argument for every parameter.
 
         A parameter is `Annotated[type, help, *more]`, an option if it is keyword-only. more: a converter of words, a
@@ -73,14 +80,15 @@ class Commands:
         takes the option repeatedly, tuple with several words. A parameter whose type is a dataclass of such fields gets
         an option for each that the command has not itself, but for fields whose metadata has command_line False, which
         are for Python alone; **fields gets what else is added to the parser, if given.
-        example: what may follow the command's name; note: a last line of help.
+        The docstring's first sentence is what the program's own help says of it. examples: what may follow the
+        command's name, one at least; note: a last line of help.
         """
         name = run.__name__.strip("_").replace("_", "-")
         text = " ".join(str(run.__doc__).split()).replace("%", "%%")
+        shown = [f"example: {self.name} {name} {words}".rstrip() for words in examples]
         command = self._commands.add_parser(
-            name, help=text[0].lower() + text[1:].rstrip("."), description=text,
-            epilog=f"example: {self.name} {name} {example}{note and chr(10) + note}",
-            formatter_class=argparse.RawDescriptionHelpFormatter if note else argparse.HelpFormatter,
+            name, help=(text[0].lower() + text[1:]).partition(". ")[0].rstrip("."), description=text,
+            epilog="\n".join([*shown, note]), formatter_class=_Help,
         )  # fmt: skip
         parameters, hints = inspect.signature(run).parameters, get_type_hints(run, include_extras=True)
         groups = {n: hints[n] for n in parameters if dataclasses.is_dataclass(hints[n])}
@@ -91,7 +99,7 @@ class Commands:
         for group, declared in groups.items():
             fields = [field for field in dataclasses.fields(declared) if field.name not in parameters]
             own[group] = [field.name for field in fields]
-            within = command.add_argument_group(f"the {group}")
+            within = command.add_argument_group(f"the {group.replace('_', ' ')}")
             meant = get_type_hints(declared, include_extras=True)
             for field in fields:
                 if field.metadata.get("command_line", True):
@@ -158,20 +166,34 @@ class _YesNo(argparse.BooleanOptionalAction):
         self.default = default
 
 
+def refuse_options(what: str, given: Mapping[str, object]) -> None:
+    """Raises UserError for the first of these options that is given (no None, False or empty one): `what` has none."""
+    for name, value in given.items():
+        if value:
+            raise UserError(f"{name}: is not for {what}")
+
+
 def print_figures(found: Any, as_json: bool) -> None:
     """What was measured, as its text() or as its as_dict()."""
     print(json.dumps(found.as_dict(), indent=2) if as_json else found.text())
 
 
-def run_program(name: str, parser: Callable[[], Parser], words: Sequence[str] | None, interrupted: str) -> int:
+def run_program(
+    name: str, parser: Callable[[], Parser], words: Sequence[str] | None, interrupted: str,
+    moved: Mapping[str, str] | None = None,
+) -> int:  # fmt: skip
     """Parse the words (default: the process's own), run the command, and return the exit status.
 
     0 done, 1 a check failed, 2 wrong input, 130 interrupted, of which `interrupted` says what it means.
+    moved: for commands that were, what does it now, after the program's name.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    words = sys.argv[1:] if words is None else words
     try:
-        options = parser().parse_args(joined(sys.argv[1:] if words is None else words))
+        if words and (now := (moved or {}).get(words[0])) is not None:
+            raise UserError(f"{words[0]}: is now '{name} {now}'")
+        options = parser().parse_args(joined(words))
         given = vars(options)
         status: int = given.pop("call")(given)
         sys.stdout.flush()

@@ -22,13 +22,6 @@ def config_file(name: str) -> Path:
     return Path(name) if Path(name).is_file() or not known.is_file() else known
 
 
-def configs_text() -> str:
-    """Names of all configs, each with the first line of its comment."""
-    files = sorted(configs_folder().glob("*.yaml"))
-    rows = [f"{file.stem:<14}{file.read_text(encoding='utf-8').partition(chr(10))[0].lstrip('# ')}" for file in files]
-    return "\n".join([*rows, f"in {configs_folder()}"])
-
-
 def configs_folder() -> Path:
     """The folder of the configs; the scenes are beside it. Raises OSError if the user's cache cannot be written."""
     share = _PACKAGE / "share"
@@ -53,4 +46,4 @@ def _kept(share: Path, cache: Path) -> Path:
     return kept
 
 
-ConfigFile = Annotated[Path, "YAML file, or a name that 'rsgen configs' lists", config_file]
+ConfigFile = Annotated[Path, "YAML file, or a name that 'rsgen scenes' lists", config_file]

@@ -25,7 +25,7 @@ EXPORTS = {
 _MESHES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 SCENES = dict.fromkeys(_MESHES, "meshes.mesh_file")
 _OTHER_SCENES = "meshes.mesh_file"
-# Files that rsgen import-scene makes a Mitsuba scene of, by suffix.
+# Files that rsgen import makes a Mitsuba scene of, by suffix.
 IMPORTS = dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "scenes.usd_stage")
 IMPORTS |= {".blend": "scenes.blend", **dict.fromkeys(_MESHES, "scenes.import_scene")}
 # What a Mitsuba scene may hold that Mitsuba 3 itself does not take.

@@ -1,4 +1,4 @@
-"""How far and how fast cameras move: the columns of the paper's Table 1, accelerations, and what `rsgen fit` shows."""
+"""How far and how fast cameras move: columns of the paper's Table 1, accelerations; what `rsgen motion fit` says."""
 
 from __future__ import annotations
 

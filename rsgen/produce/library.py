@@ -14,6 +14,7 @@ import sys
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from rsgen.console.tables import Table
 from rsgen.errors import UserError
 from rsgen.files import parse_yaml
 
-_SHORT = 110  # characters of what a scene is
+_SHORT = 110  # characters of what a scene or a config is
 _PLY_TYPES = {
     b"char": "i1", b"uchar": "u1", b"short": "<i2", b"ushort": "<u2", b"int": "<i4", b"uint": "<u4", b"float": "<f4",
     b"double": "<f8",
@@ -46,9 +47,10 @@ class ShippedScene:
     configs: tuple[Path, ...]
 
     @property
-    def config_names(self) -> str:
-        """Names of its configs in one line."""
-        return " ".join(file.stem for file in self.configs) or "none yet"
+    def config_lines(self) -> list[str]:
+        """Of each config its name, and what it says of itself; a line that there is none."""
+        told = [f"{file.stem:<14} {_first_comment(file)}".rstrip() for file in self.configs]
+        return told or ["none yet"]
 
     @property
     def how_to_vary(self) -> str:
@@ -78,9 +80,11 @@ class Listing:
         blocks = []
         for scene, contents in self.entries:
             lines = [f"{scene.name}: {scene.about}", f"  {_built_text(contents)}"]
-            lines += [f"  configs: {scene.config_names}", f"  another by seed: {scene.how_to_vary}"]
+            lines += [f"  another by seed: {scene.how_to_vary}", "  configs:"]
+            lines += [f"    {line}" for line in scene.config_lines]
             blocks.append("\n".join(lines))
-        return "\n".join([*blocks, f"in {self.folder} (rsgen scenes NAME tells more of one)"])
+        note = "rsgen scenes NAME tells more of one, rsgen render CONFIG renders"
+        return "\n".join([*blocks, f"in {self.folder} ({note})"])
 
     def as_dict(self) -> dict[str, Any]:
         """The same by name, sizes in m."""
@@ -109,7 +113,8 @@ class Description:
             rows.append(("floor", f"at y = {y:.3f} m, {high}"))
         if contents is not None:
             rows.append(("materials", f"{len(contents.materials)}: {' '.join(contents.materials)}"))
-        rows += [("configs", scene.config_names), ("another", scene.how_to_vary)]
+        rows += [("configs" if k == 0 else "", line) for k, line in enumerate(scene.config_lines)]
+        rows.append(("another", scene.how_to_vary))
         rows.append(("a tour", f"rsgen motion suggest {scene.file} --seed N --out my.yaml"))
         return Table((scene.name, ""), tuple(rows), words=(0, 1)).text()
 
@@ -199,8 +204,17 @@ def _about(tree: ast.Module) -> str:
         if isinstance(node, ast.Assign) and [getattr(t, "id", "") for t in node.targets] == ["ABOUT"]:
             return str(ast.literal_eval(node.value))
     head, _, rest = (ast.get_docstring(tree) or "").partition("\n\n")
-    text = " ".join((rest.partition("\n\n")[0] or head).split())
-    sentence = text.partition(". ")[0].rstrip(".")
+    return _first_sentence(rest.partition("\n\n")[0] or head)
+
+
+def _first_comment(file: Path) -> str:
+    """The first sentence of the comment that a config begins with."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    return _first_sentence(" ".join(line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), lines)))
+
+
+def _first_sentence(text: str) -> str:
+    sentence = " ".join(text.split()).partition(". ")[0].rstrip(".")
     return sentence if len(sentence) <= _SHORT else sentence[:_SHORT].rpartition(" ")[0] + " ..."
 
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from rsgen.console.command_line import Frames, Quiet
-from rsgen.console.configs import ConfigFile
+from rsgen.console.command_line import Frames, Quiet, refuse_options
+from rsgen.console.configs import config_file
 from rsgen.console.scheduler import Scheduler
 from rsgen.errors import UserError
 from rstrack.cli.options import TruthOffset
@@ -59,7 +59,9 @@ class Narrowed:
 def bench(
     tracker: Options,
     narrowed: Narrowed,
-    config: ConfigFile = Path("evaluation"),
+    config: Annotated[Path, "evaluation, readout_sweep, stress, or a YAML file like these", config_file] = Path(
+        "evaluation"
+    ),
     *,
     data: Annotated[Path, "folder that holds the sequences", "DIR"] = Path("out"),
     out: Annotated[
@@ -146,9 +148,7 @@ def bench(
 
 def _refuse(what: str, given: Mapping[str, object], frames: slice | None) -> None:
     """Raises UserError for an option that what is run does not have."""
-    name = next((name for name, value in given.items() if value), None)
-    if name is not None:
-        raise UserError(f"{name}: is not for {what}")
+    refuse_options(what, given)
     if frames is not None and frames.start:
         raise UserError(f"--frames {frames.start}:...: {what} begins with frame 0: --frames 0:{frames.stop or 60}")
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from rsgen.console.command_line import Commands, Parser, Quiet, run_program
 from rstrack.cli.benchmark import BENCH_STATUS, bench
 from rstrack.cli.options import CameraFile, ImuFile, SequenceFolder
-from rstrack.cli.results import evaluate, export, keyframes, map_, map_eval, plot, report
+from rstrack.cli.results import evaluate, export, map_, report
 from rstrack.cli.tracking import CALIBRATE_STATUS, TRACK_STATUS, calibrate, refine, track
 
 _DESCRIPTION = """\
@@ -23,20 +23,26 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack calibrate out/demo --out camera.yaml         readouts, clocks and extrinsics out of the recording itself
   rstrack refine runs/demo --out runs/refined          every frame against all that overlap it: slow, accurate
   rstrack evaluate out/demo runs/demo                  errors against the ground truth
-  rstrack export runs/demo covariance --out demo.cov   poses with their covariances, for smfeval
-  rstrack plot out/demo runs/demo --out demo.png       path and errors as a picture
-  rstrack report runs/demo                             tables, plots and the path as one HTML page
+  rstrack report runs/demo                             tables, plots and the path as one HTML page, or a picture
   rstrack map out/demo runs/demo --out mesh.ply        the observed surfaces as a coloured mesh
+  rstrack evaluate out/demo mesh.ply                   its distance from the scene
+  rstrack export runs/demo covariance --out demo.cov   for other tools: poses with their covariances, keyframes
   rstrack bench --quick                                every method on some sequences, beside the paper's figures
 
 A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D, ICL-NUIM or 7-Scenes folder; the first two of those
 need their cameras in a camera.yaml, calibration.yaml or camchain.yaml inside, or in the file that --camera names.
 """
+# What became of commands that were.
+_MOVED = {
+    "plot": "report RUN --sequence SEQ --out FILE.png",
+    "map-eval": "evaluate SEQ MESH",
+    "keyframes": "export RUN keyframes --sequence SEQ --out DIR",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status: 0 done, 1 frames lost, 2 wrong input, 130 interrupted."""
-    return run_program("rstrack", _parser, arguments, "nothing was written")
+    return run_program("rstrack", _parser, arguments, "nothing was written", _MOVED)
 
 
 class _Version(argparse.Action):
@@ -56,19 +62,16 @@ def _parser() -> Parser:
         "--version", action=_Version, nargs=0, default=argparse.SUPPRESS, help="print the version and exit"
     )
     add = commands.add
-    add(track, "out/lr_kt2 --method rs-pg --out runs/lr_kt2 --frames 0:300 --noise-depth 1.2e-3", TRACK_STATUS)
-    add(calibrate, "recording --out camera.yaml", CALIBRATE_STATUS)
-    add(refine, "runs/table1 --out runs/table1-refined")
-    add(evaluate, "out/lr_kt2 runs/lr_kt2 --json")
-    add(plot, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.png")
-    add(export, "runs/lr_kt2 covariance --out lr_kt2.cov")
-    add(info, "out/lr_kt2")
     add(import_, "mine.bag mine --color /camera/color/image_raw --device realsense-d435")
-    add(report, "runs/lr_kt2 --sequence out/lr_kt2")
+    add(info, "out/lr_kt2")
+    add(calibrate, "recording --out camera.yaml", note=CALIBRATE_STATUS)
+    add(track, "out/lr_kt2 --method rs-pg --out runs/lr_kt2 --frames 0:300 --noise-depth 1.2e-3", note=TRACK_STATUS)
+    add(refine, "runs/table1 --out runs/table1-refined")
+    add(evaluate, "out/lr_kt2 runs/lr_kt2 --json", "out/lr_kt2 lr_kt2.ply", "truth.txt estimate.txt")
+    add(report, "runs/lr_kt2 --sequence out/lr_kt2", "runs/lr_kt2 --out lr_kt2.png")
     add(map_, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.ply --every 5")
-    add(map_eval, "lr_kt2.ply out/lr_kt2/scene.ply")
-    add(keyframes, "out/table1 runs/table1 --out keyframes")
-    add(bench, "--data out --out out/bench --sequence robot_t1 robot_r1 --method baseline rs-pg", BENCH_STATUS)
+    add(export, "runs/lr_kt2 covariance --out lr_kt2.cov", "runs/table1 keyframes --out keyframes")
+    add(bench, "--data out --out out/bench --sequence robot_t1 robot_r1 --method baseline rs-pg", note=BENCH_STATUS)
     return commands.parser
 
 

@@ -105,7 +105,7 @@ def track(
             "the camera file has no distortion, which hardly any camera is without: --calibrate finds lens, clocks and "
             "readouts first"
         )
-    print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack plot ...)")
+    print(f"{out}: written (rstrack evaluate {sequence} {out}, rstrack report {out})")
     sys.stdout.flush()
     if result.end == "interrupted":
         print("rstrack: interrupted; the frames before are in the run folder", file=sys.stderr)

@@ -162,7 +162,7 @@ def evaluate_map(mesh: FloatArray, scene: FloatArray, seen: FloatArray | None, s
     `samples` points of each side at most. Raises UserError if a side is empty.
     """
     if not len(mesh) or not len(scene):
-        raise UserError("map-eval: a surface without triangles cannot be compared: give meshes, not point clouds")
+        raise UserError("a surface without triangles cannot be compared: give meshes, not point clouds")
     rng = np.random.default_rng(0)
     accuracy = Triangles(scene).distance(sample_surface(mesh, samples, rng))
     if seen is None or not len(seen):

@@ -187,7 +187,7 @@ def test_what_fails_is_said_and_the_others_are_drawn(
     monkeypatch.setattr(subprocess, "run", RUN)
     assert draw_meshes(of(place), out, ("rs-pg",), warn=said.append) == []
     (told,) = said
-    assert "no picture of the meshes of a: rsgen picture --quiet failed: " in told and "mesh.ply" in told
+    assert "no picture of the meshes of a: rsgen preview --quiet failed: " in told and "mesh.ply" in told
 
 
 def test_lost_tracks_are_not_shown(place: Path, calls: list[str]) -> None:

@@ -15,7 +15,7 @@ from rsgen.image_codecs import encode_png
 
 
 def usd(folder: Path) -> Iterator[Case]:
-    """Scenes that `rsgen import-scene` reads by way of USD, as text, binary and in a zip."""
+    """Scenes that `rsgen import` reads by way of USD, as text, binary and in a zip."""
     from pxr import Usd, UsdUtils
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -76,7 +76,7 @@ def _fill(file: Path, folder: Path, scale: float | None, up: Up | None) -> tuple
         f"{len(content.lamps)} lights" + (", and surfaces that glow" if glows else ""),
     )
     scene = {"type": "scene", **part_shapes(mi, parts, folder), **lights}
-    write_scene(scene, [f"made by rsgen import-scene of {file.name}", *found, *notes], folder)
+    write_scene(scene, [f"made by 'rsgen import' of {file.name}", *found, *notes], folder)
     return found, tuple(notes)
 
 
@@ -109,7 +109,7 @@ def write_folder(out: Path, force: bool, fill: Callable[[Path], Made]) -> Made:
     if out.exists() and not force:
         raise UserError(f"{out}: is there already: choose another folder, or replace it with --force")
     if out.exists() and not (out / NAME).is_file() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out}: is no folder of import-scene ({NAME} is not in it): delete it yourself")
+        raise UserError(f"{out}: is no folder of 'rsgen import' ({NAME} is not in it): delete it yourself")
     new, old = (out.with_name(f".{out.name}.{os.getpid()}.{word}") for word in ("new", "old"))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

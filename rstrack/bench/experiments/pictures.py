@@ -218,7 +218,7 @@ def _draw(sequence: str, parts: list[dict[str, Any]], out: Path) -> Path:
         return path
     _remove(about)
     # Mitsuba draws, which the tracker's process never loads.
-    words = ["picture", "--quiet", f"--out={path.resolve()}", f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
+    words = ["preview", "--quiet", f"--out={path.resolve()}", f"--width={_PANEL_PX[0]}", f"--height={_PANEL_PX[1]}"]
     words += [f"--label={part['label']}" for part in parts]
     run_rsgen([*words, *(str((out / "cells" / part["cell"] / MESH).resolve()) for part in parts)])
     atomic_write(about, _json(pictured))

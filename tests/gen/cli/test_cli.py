@@ -102,44 +102,53 @@ def refused(capfd: pytest.CaptureFixture[str], words: str | list[str], *parts: s
         ("render tiny.yaml --out paper.png/seq", ["paper.png/seq"]),
         ("render tiny.yaml --out .", ["holds other files"]),
         ("render tiny.yaml --out seq --color.spp 5", ["seq", "color.spp"]),
-        ("compare seq --frame 1 --out c.xyz", ["c.xyz", ".png"]),
-        ("fit nowhere.txt", ["nowhere.txt"]),
-        ("fit paper.png", ["paper.png"]),
-        ("fit motion.txt --dt 0", ["knot spacing"]),
-        ("fit motion.txt --dt -1", ["knot spacing"]),
-        ("fit motion.txt --dt nan", ["knot spacing"]),
-        ("fit motion.txt --dt inf", ["knot spacing"]),
-        ("fit motion.txt --dt 1e-9", ["knot spacing"]),
-        ("fit motion.txt --dt soon", ["--dt", "soon"]),
-        ("fit motion.txt --smoothing -1", ["smoothing"]),
-        ("fit motion.txt --format doc", ["--format", "doc"]),
-        ("fit motion.txt --format icl", ["motion.txt:3", "frame index"]),
-        ("fit motion.txt --plot paper.png/fit.png", ["paper.png"]),
+        ("preview seq --frame 1 --out c.xyz", ["c.xyz", ".png"]),
+        ("motion fit nowhere.txt", ["nowhere.txt"]),
+        ("motion fit paper.png", ["paper.png"]),
+        ("motion fit motion.txt --dt 0", ["knot spacing"]),
+        ("motion fit motion.txt --dt -1", ["knot spacing"]),
+        ("motion fit motion.txt --dt nan", ["knot spacing"]),
+        ("motion fit motion.txt --dt inf", ["knot spacing"]),
+        ("motion fit motion.txt --dt 1e-9", ["knot spacing"]),
+        ("motion fit motion.txt --dt soon", ["--dt", "soon"]),
+        ("motion fit motion.txt --smoothing -1", ["smoothing"]),
+        ("motion fit motion.txt --format doc", ["--format", "doc"]),
+        ("motion fit motion.txt --format icl", ["motion.txt:3", "frame index"]),
+        ("motion fit motion.txt --plot paper.png/fit.png", ["paper.png"]),
         ("info nowhere", ["nowhere"]),
         ("info paper.png", ["paper.png"]),
         ("info .", ["sequence.yaml"]),
-        ("compare seq", ["--frame"]),
-        ("compare seq --frame 5", ["no color frame 5", "0 to 4"]),
-        ("compare seq --frame -1", ["frame -1"]),
-        ("compare seq --frame two", ["two"]),
-        ("compare seq --frame 1 --scene nowhere.xml", ["nowhere.xml"]),
-        ("compare nowhere --frame 1", ["nowhere"]),
+        ("preview seq --frame 5", ["no color frame 5", "0 to 4"]),
+        ("preview seq --frame -1", ["frame -1"]),
+        ("preview seq --frame two", ["two"]),
+        ("preview seq --frame 1 --scene nowhere.xml", ["nowhere.xml"]),
+        ("preview nowhere --frame 1", ["nowhere"]),
         ("preview nowhere", ["nowhere"]),
         ("preview seq --count 0", ["--count", "at least 1"]),
         ("preview seq --out seq", ["seq: "]),
+        ("preview", ["SEQ|MESH"]),
+        ("preview seq seq", ["more than one sequence"]),
+        ("preview seq --grey", ["--grey", "a sequence"]),
+        ("preview seq --from 0,1,2", ["--from", "a sequence"]),
+        ("preview seq --scene scene.xml", ["--scene", "without --frame"]),
+        ("preview seq --frame 1 --count 3", ["--count", "one --frame"]),
+        ("preview seq/scene.ply", ["--out"]),
+        ("preview seq/scene.ply --out p.png --frame 0", ["--frame", "meshes"]),
+        ("preview seq/scene.ply --out p.png --from here", ["'here' is no point"]),
+        ("preview seq nowhere.ply --out p.png", ["seq"]),
+        ("preview paper.png --out p.png", ["paper.png", "no mesh"]),
         ("verify", ["sequence"]),
         ("verify seq --pairs x", ["--pairs", "x"]),
         ("verify seq --pairs -1", ["--pairs"]),
-        ("check-light tiny.yaml --color.spp 0", ["color.spp"]),
-        ("check-light tiny.yaml color.spp=3", ["color.spp=3"]),
-        ("check-light tiny.yaml --light.mode path", ["light.mode"]),
-        ("check-light tiny.yaml --width 7", ["--width 7"]),
-        ("check-light tiny.yaml --width 4000", ["--width 4000"]),
-        ("check-light tiny.yaml --views 0", ["--views"]),
-        ("check-light tiny.yaml --spp 0", ["--spp"]),
-        ("check-light nowhere.yaml", ["nowhere.yaml"]),
-        ("check-light tiny.yaml --nonsense 3", ["--nonsense"]),
-        ("check-light tiny.yaml --trajectory.file nowhere.txt", ["nowhere.txt"]),
+        ("verify seq --light 0", ["--light"]),
+        ("verify seq --light-width 24", ["--light-width", "without --light"]),
+        ("verify seq --scene scene.xml", ["--scene", "without --light"]),
+        ("compare seq --frame 1", ["compare: is now 'rsgen preview SEQ --frame N'"]),
+        ("picture --help", ["picture: is now 'rsgen preview MESH ... --out PNG'"]),
+        ("configs", ["configs: is now 'rsgen scenes'"]),
+        ("fit motion.txt", ["fit: is now 'rsgen motion fit FILE'"]),
+        ("import-scene a.blend b", ["import-scene: is now 'rsgen import FILE OUT'"]),
+        ("check-light tiny.yaml", ["check-light: is now 'rsgen verify SEQ --light N'"]),
     ],
 )  # fmt: skip
 def test_wrong_words_give_one_line_and_change_nothing(
@@ -164,7 +173,6 @@ def test_wrong_inputs_give_one_line_that_names_the_file(
     assert tiny.digests(place / "seq") == before
     refused(capfd, "render tiny.yaml --out new --quiet", *parts)
     assert not (place / "new").exists()
-    refused(capfd, "check-light tiny.yaml --views 1 --spp 1 --width 8", *parts)
 
 
 @pytest.mark.parametrize("fault", SEQUENCES)
@@ -174,7 +182,7 @@ def test_damaged_sequences_are_refused_by_what_needs_the_damaged_file(
     spoil, culprit, commands = SEQUENCES[fault]
     spoil()
     before = tiny.digests(place / "seq")
-    words = {"info": "info seq", "compare": "compare seq --frame 1", "preview": "preview seq --count 9"}
+    words = {"info": "info seq", "compare": "preview seq --frame 1", "preview": "preview seq --count 9"}
     for command in commands.split():
         refused(capfd, words[command], culprit)
     if culprit:
@@ -256,12 +264,34 @@ def test_a_folder_that_may_not_be_written_is_named(
 # --- what works ------------------------------------------------------------------------------------------------------
 
 
-def test_check_light_takes_the_overrides_of_render(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (place / "motion.txt").rename("moved.txt")
-    overrides = ["--trajectory.file", "moved.txt", "--light.texel_m=0.3"]
-    words = ["check-light", *overrides, "tiny.yaml", "--views", "1", "--spp", "64", "--width", "24", "--out", "l.png"]
+def test_verify_compares_baked_light_with_path_tracing(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["verify", "seq", "--light", "1", "--light-spp", "64", "--light-width", "24", "--light-picture", "l.png"]
     status, out, _ = run(capfd, *words)
-    assert status in (0, 1) and "PSNR" in out and Path("l.png").stat().st_size > 1000
+    assert status in (0, 1) and "all checks passed" in out and "PSNR" in out
+    assert status == (1 if "unsure" in out or "no\n" in out else 0) and Path("l.png").stat().st_size > 1000
+    for wrong in ("7", "4000"):
+        assert run(capfd, "verify", "seq", "--light", "1", "--light-width", wrong)[0] == 2
+    Path("seq/origin.yaml").unlink()
+    status, _, error = run(capfd, *words)
+    assert status == 2 and "--scene" in error
+    assert run(capfd, *words, "--scene", "scene.xml")[0] in (0, 1)
+
+
+def test_light_of_one_frame_can_be_checked(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert (
+        run(capfd, "render", "tiny.yaml", "--out", "one", "--frames", "0:1", "--light.texel_m=0.3", "--quiet")[0] == 0
+    )
+    status, out, _ = run(capfd, "verify", "one", "--light", "1", "--light-spp", "64", "--light-width", "24")
+    assert status in (0, 1) and "PSNR" in out
+    assert run(capfd, "render", "tiny.yaml", "--out", "path", "--frames", "0:1", "--light.mode=path", "--quiet")[0] == 0
+    status, _, error = run(capfd, "verify", "path", "--light", "1")
+    assert status == 2 and "light.mode" in error
+
+
+def test_meshes_are_drawn(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = "preview seq/scene.ply seq/scene.ply --out m.png --label one --label two --width 64 --height 48 --quiet"
+    status, out, error = run(capfd, *words.split())
+    assert (status, out, error) == (0, "m.png\n", "") and Path("m.png").stat().st_size > 1000
 
 
 def test_overrides_may_come_in_any_order_and_the_last_one_counts(
@@ -276,9 +306,9 @@ def test_overrides_may_come_in_any_order_and_the_last_one_counts(
 
 
 def test_fit_prints_its_report_as_text_json_and_picture(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = run(capfd, "fit", "motion.txt", "--plot", "fit.png")
+    status, out, _ = run(capfd, "motion", "fit", "motion.txt", "--plot", "fit.png")
     assert status == 0 and "mm" in out and Path("fit.png").stat().st_size > 1000
-    status, out, _ = run(capfd, "fit", "motion.txt", "--json")
+    status, out, _ = run(capfd, "motion", "fit", "motion.txt", "--json")
     assert status == 0 and isinstance(yaml.safe_load(out), dict)
 
 

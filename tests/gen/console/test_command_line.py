@@ -44,7 +44,7 @@ def do_it(
 
 def run(words: str) -> int:
     commands = Commands("program", "test")
-    command = commands.add(do_it, "here", "a note")
+    command = commands.add(do_it, "here", "there", note="a note")
     command.add_argument("--a.b", default=argparse.SUPPRESS)
     return run_program("program", lambda: commands.parser, words.split(), "")
 
@@ -83,7 +83,8 @@ def test_help_says_name_meaning_and_default_once(capfd: pytest.CaptureFixture[st
     text = " ".join(capfd.readouterr().out.split())
     for part in (
         "Do it.", "--size-m M, --size M how large, m (default: 0.5)", "--fuse, --no-fuse together (default: yes) ",
-        "--pairs N 100 % of them (default: 2)", "the thing:", "example: program do-it here a note",
+        "--pairs N 100 % of them (default: 2)", "the thing:",
+        "example: program do-it here example: program do-it there a note",
     ):  # fmt: skip
         assert part in text, part
     assert text.count("--label") == 2  # in the usage, and with its help

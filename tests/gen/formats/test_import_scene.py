@@ -102,7 +102,7 @@ def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert (out / "scene.xml").read_text() == "two" and [p.name for p in tmp_path.iterdir()] == ["room"]
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/diary.txt").write_text("mine")
-    with pytest.raises(UserError, match="no folder of import-scene"):
+    with pytest.raises(UserError, match="no folder of 'rsgen import'"):
         write_folder(tmp_path / "mine", True, fails)
 
 
@@ -119,7 +119,7 @@ def test_what_is_missing_is_said_in_one_line(
         ("a.txt", "is no file to import: of these kinds are read: .usd"),
         ("none.usdz", "no such file"),
     ]:
-        assert main(["import-scene", str(tmp_path / name), str(tmp_path / "out")]) == 2
+        assert main(["import", str(tmp_path / name), str(tmp_path / "out")]) == 2
         said = capsys.readouterr().err
         assert text in said and said.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -132,7 +132,7 @@ def test_colours_survive_as_bytes() -> None:
 
 
 def test_another_kind_of_scene_is_one_module_and_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of scene.file and of import-scene: boxes as lines of numbers, by the lines in the registry."""
+    """Of scene.file and of `rsgen import`: boxes as lines of numbers, by the lines in the registry."""
     module: Any = ModuleType("rsgen.formats.meshes.boxes")
 
     def parts(path: Path, scale: float) -> list[Part]:

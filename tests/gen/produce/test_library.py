@@ -56,7 +56,8 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "parts.py").write_text("def other():\n    pass\n")
     (tmp_path / "configs").mkdir()
     config = {"name": "round", "trajectory": {"file": "t.txt"}, "scene": {"file": "../scenes/cell/scene.xml"}}
-    (tmp_path / "configs" / "round.yaml").write_text(yaml.safe_dump(config))
+    comment = "# Round the\n# cell. More of it\n"
+    (tmp_path / "configs" / "round.yaml").write_text(comment + yaml.safe_dump(config) + "# and below\n")
     monkeypatch.setattr(library, "configs_folder", lambda: tmp_path / "configs")
     return folder
 
@@ -78,7 +79,7 @@ def test_a_scene_that_is_not_built_is_said_to_be_so(cell: Path, capsys: pytest.C
     assert main(["scenes"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("cell: A cell of {size} m, for tests\n  not built yet")
-    assert "configs: round\n" in text and "rsgen scenes cell --seed N --out DIR" in text
+    assert "configs:\n    round          Round the cell\n" in text and "rsgen scenes cell --seed N --out DIR" in text
     assert main(["scenes", "cell", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["built"] is False and facts["triangles"] is None and facts["floor_y_m"] is None

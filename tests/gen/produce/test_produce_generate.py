@@ -78,7 +78,7 @@ def test_info_names_what_is_there(whole: Path, capfd: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize(
-    ("words", "default"), [(["preview"], "preview.png"), (["compare", "--frame", "2"], "compare_000002.png")]
+    ("words", "default"), [(["preview"], "preview.png"), (["preview", "--frame", "2"], "compare_000002.png")]
 )
 def test_pictures_are_written(whole: Path, tmp_path: Path, words: list[str], default: str) -> None:
     before = tiny.digests(whole)
@@ -95,7 +95,7 @@ def test_compare_needs_no_origin_if_the_scene_is_named(folder: Path, whole: Path
     origin = (whole / "origin.yaml").read_bytes()
     (whole / "origin.yaml").unlink()
     try:
-        words = ["compare", str(whole), "--frame", "0", "--out", str(tmp_path / "c.png")]
+        words = ["preview", str(whole), "--frame", "0", "--out", str(tmp_path / "c.png")]
         assert main(words) == 2
         assert main([*words, "--scene", str(folder / "scene.xml")]) == 0
     finally:
@@ -105,7 +105,7 @@ def test_compare_needs_no_origin_if_the_scene_is_named(folder: Path, whole: Path
 def test_compare_says_if_the_scene_has_changed(
     folder: Path, whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    words = ["compare", str(whole), "--frame", "0", "--out", str(tmp_path / "c.png"), "--scene"]
+    words = ["preview", str(whole), "--frame", "0", "--out", str(tmp_path / "c.png"), "--scene"]
     with caplog.at_level(logging.WARNING, "rsgen"):
         assert main([*words, str(folder / "scene.xml")]) == 0 and not caplog.messages
         other = tiny.write_scene(tmp_path / "other")

@@ -17,7 +17,7 @@ from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
 from rstrack.options import METHODS, Options
 
-COMMANDS = ("track", "evaluate", "export", "plot", "info")
+COMMANDS = ("import", "info", "calibrate", "track", "refine", "evaluate", "report", "map", "export", "bench")
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_the_main_help_lists_every_command_and_version_says_the_version(capfd: p
     with pytest.raises(SystemExit):
         main(["--help"])
     text = capfd.readouterr().out
-    assert all(f"  {command}" in text for command in COMMANDS) and "rstrack track out/demo" in text
+    assert all(f"\n    {command}" in text for command in COMMANDS) and "rstrack track out/demo" in text
     with pytest.raises(SystemExit) as exit:
         main(["--version"])
     out = capfd.readouterr().out.split()
@@ -97,9 +97,15 @@ def test_every_option_of_the_tracker_is_explained(capfd: pytest.CaptureFixture[s
         ("evaluate seq", ["run"]),
         ("evaluate seq nowhere", ["nowhere"]),
         ("evaluate seq seq/rgb", ["seq/rgb", "trajectory.txt"]),
-        ("plot seq run", ["--out"]),
-        ("plot seq run --out run/run.json/p.png", ["run.json/p.png"]),
-        ("plot seq run --out p.docx", ["p.docx"]),
+        ("report run --out run/run.json/p.png", ["run.json/p.png"]),
+        ("report run --out p.docx", ["p.docx"]),
+        ("export run covariance --out c.txt --sequence seq", ["--sequence", "covariance"]),
+        ("export run pictures --out p", ["pictures"]),
+        ("evaluate seq mesh.ply --against run", ["--against", "a mesh"]),
+        ("evaluate seq mesh.ply", ["mesh.ply"]),
+        ("plot seq run --out p.png", ["plot: is now 'rstrack report RUN --sequence SEQ --out FILE.png'"]),
+        ("map-eval mesh.ply seq/scene.ply", ["map-eval: is now 'rstrack evaluate SEQ MESH'"]),
+        ("keyframes seq run --out k", ["keyframes: is now 'rstrack export RUN keyframes --sequence SEQ --out DIR'"]),
         ("info run/run.json", ["run.json"]),
     ],
 )  # fmt: skip
@@ -190,9 +196,9 @@ def test_options_reach_the_tracker(place: Path, capfd: pytest.CaptureFixture[str
     assert info["metrics"]["frames"] == 7 and info["dataset"]["frames"] == [2, 9]
 
 
-def test_plot_draws_runs_and_tum_files(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_report_draws_runs_and_tum_files(place: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for what in ("run", "run/trajectory.txt"):
-        assert run(capfd, f"plot seq {what} --out p.png")[0] == 0
+        assert run(capfd, f"report {what} --sequence seq --out p.png") == (0, "p.png: written\n", "")
         assert cv2.imread("p.png").shape[1] == 1600
         Path("p.png").unlink()
 

@@ -44,7 +44,7 @@ def test_a_tum_folder_without_truth_is_tracked_but_not_evaluated(
     status, out, error = run(capfd, "track seq --camera c.yaml --out r --frames 0:8")
     assert status == 0 and "ATE" not in out + error and read_info("r")["metrics"] is None
     refused(capfd, "evaluate seq r --camera c.yaml", "ground truth")
-    assert run(capfd, "plot seq r --camera c.yaml --out p.png")[0] == 0
+    assert run(capfd, "report r --sequence seq --camera c.yaml --out p.png")[0] == 0
 
 
 def test_one_frame_is_a_run_that_cannot_be_evaluated(place: Path, capfd: pytest.CaptureFixture[str]) -> None:

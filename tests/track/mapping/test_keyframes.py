@@ -21,13 +21,16 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return synthetic.make_sequence(tmp_path_factory.mktemp("room") / "seq", synthetic.make_config(128, 96), 12)
 
 
-def test_they_are_a_folder_that_can_be_tracked(root: Path, tmp_path: Path) -> None:
+def test_they_are_a_folder_that_can_be_tracked(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = open_dataset(root).truth
     assert truth is not None
     stamps = open_dataset(root).stamps
     write_estimate(tmp_path / "run", stamps, truth.pose(stamps), truth, {})
     out = tmp_path / "keyframes"
-    assert main(["keyframes", str(root), str(tmp_path / "run"), "--out", str(out), "--quiet"]) == 0
+    words = [str(tmp_path / "run"), "keyframes", "--out", str(out), "--quiet"]
+    assert main(["export", *words]) == 2 and not out.exists()
+    assert "name it with --sequence" in capsys.readouterr().err
+    assert main(["export", *words, "--sequence", str(root)]) == 0
     found = open_dataset(out)
     assert len(found) >= 2 and found.rig.depth_shutter.readout_s == 0.0
     rows = np.loadtxt(out / "trajectory.txt", ndmin=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.reader import read_sequence
+from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.mapping.map import Reconstruction, reconstruct, run_map
@@ -114,7 +116,9 @@ def test_the_estimates_own_world(dataset: Dataset, root: Path, tmp_path: Path) -
         run_map_eval(tmp_path / "mesh.ply", root / "scene.ply")
 
 
-def test_from_folder_to_figures(dataset: Dataset, root: Path, tmp_path: Path) -> None:
+def test_from_folder_to_figures(
+    dataset: Dataset, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     estimate = exact(dataset)
     write_estimate(tmp_path / "run", estimate.stamps, estimate.T_world_depth, estimate.spline, {})
     stages = []
@@ -130,6 +134,11 @@ def test_from_folder_to_figures(dataset: Dataset, root: Path, tmp_path: Path) ->
     assert report.accuracy.mean_m < 2e-3 and report.accuracy.median_m < 5e-4
     assert report.completeness.median_m < 1e-3 and report.within_2cm > 0.8
     assert "accuracy, mm" in report.text() and report.as_dict()["accuracy"]["points"] == 2000
+    for truth in (root, root / "scene.ply"):
+        assert main(["evaluate", str(truth), str(tmp_path / "mesh.ply"), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["accuracy"]["median_m"] < 5e-4
+    assert main(["evaluate", str(root), str(tmp_path / "mesh.ply"), "--truth-offset", "0.01"]) == 2
+    assert "--truth-offset: is not for a mesh" in capsys.readouterr().err
     for wrong in (tmp_path / "mesh.obj", tmp_path / "nowhere" / "mesh.ply"):
         with pytest.raises(UserError, match="mesh"):
             run_map(root, tmp_path / "run", wrong, OPTIONS)
