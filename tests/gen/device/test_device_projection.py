@@ -108,6 +108,15 @@ def test_push_is_the_transpose_of_pull() -> None:
     np.testing.assert_allclose((pulled * v).sum(axis=1), (a * pushed).sum(axis=1), rtol=1e-3, atol=1e-2)
 
 
+@pytest.mark.parametrize(("count", "first", "stride"), [(12, 0, 12), (18, 0, 18), (6, 12, 18), (6, 0, 6), (3, 1, 7)])
+def test_packets_hold_the_floats_that_are_asked_for(count: int, first: int, stride: int) -> None:
+    rows = np.random.default_rng(count).normal(size=(9, stride)).astype(np.float32)
+    entry = np.array([8, 0, 3, 3, 5, 1], np.uint32)
+    got = gather(ENGINE.upload(rows), ENGINE.UInt(entry), count, first, stride)
+    want = rows[entry, first : first + count]
+    np.testing.assert_array_equal(np.stack([value.numpy() for value in got], axis=-1), want)
+
+
 def test_move_cross_and_gather() -> None:
     rng = np.random.default_rng(3)
     T = se3.exp(rng.normal(size=(7, 6)))
