@@ -93,14 +93,32 @@ def _parser() -> Parser:
 
 
 def _add_fields(command: argparse.ArgumentParser) -> None:
-    """One option for every field of the config, `--section.field VALUE`; the last one given counts."""
+    """One option for every field of the config, `--section.field VALUE`; the last one given counts.
+
+    What several sections have alike, as the cameras and the controllers, is explained once.
+    """
     from rsgen.config.config import describe_fields
 
     command.usage = "%(prog)s [options] [--SECTION.FIELD VALUE ...] config"
-    group = command.add_argument_group("fields of the config, which these override (values are YAML)")
-    for name, default, text in describe_fields():
+    rows = describe_fields()
+    sections = dict.fromkeys(name.partition(".")[0] for name, _, _ in rows if "." in name)
+    of_all = command.add_argument_group("fields of the config, which these override (values are YAML)")
+    groups = {section: command.add_argument_group(section) for section in sections}
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for name, default, text in rows:
+        alike.setdefault((name.rpartition(".")[2], default, text), []).append(name)
+    for (_, default, text), names in alike.items():
         help = f"{text} (default: {default})".replace("%", "%%")
-        group.add_argument(f"--{name}", default=argparse.SUPPRESS, metavar="VALUE", help=help)
+        groups.get(names[0].partition(".")[0], of_all).add_argument(
+            *(f"--{name}" for name in names), action=_Field, default=argparse.SUPPRESS, metavar="VALUE", help=help
+        )
+
+
+class _Field(argparse.Action):
+    """Keeps a value under the name of the option that it was given to."""
+
+    def __call__(self, _: object, namespace: object, values: Any, option: str | None = None) -> None:
+        setattr(namespace, str(option).removeprefix("--"), values)
 
 
 def scenes(

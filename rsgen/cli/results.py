@@ -105,25 +105,27 @@ def preview(
     from rsgen.pictures.frames import compare_frame, preview_sequence
     from rsgen.pictures.meshes import parse_point, picture_meshes
 
-    if any(path.suffix and not path.is_dir() for path in what):
+    of_meshes = any(path.suffix and not path.is_dir() for path in what)
+    if of_meshes:
         refuse_options("meshes", {"--count": count, "--frame": frame is not None, "--scene": scene})
-        if out is None:
-            raise UserError("--out: is needed for a picture of meshes")
-        eye, target = (None if text is None else parse_point(text) for text in (meshes.from_, meshes.at))
-        with ProgressDisplay(quiet) as progress:
-            print(picture_meshes(
-                what, out, meshes.label, eye, target, meshes.width, meshes.height, meshes.grey, progress
-            ))  # fmt: skip
-        return 0
-    _refuse_others("a sequence", meshes, MeshView())
-    if len(what) > 1:
-        raise UserError(f"{what[1]}: is more than one sequence: give one")
-    if frame is None:
-        refuse_options("a preview without --frame", {"--scene": scene})
-        print(preview_sequence(what[0], out, count or 4))
     else:
-        refuse_options("one --frame", {"--count": count})
-        print(compare_frame(what[0], frame, out, scene))
+        _refuse_others("a sequence", meshes, MeshView())
+        if len(what) > 1:
+            raise UserError(f"{what[1]}: is more than one sequence: give one")
+    with ProgressDisplay(quiet) as progress:
+        if of_meshes:
+            if out is None:
+                raise UserError("--out: is needed for a picture of meshes")
+            eye, target = (None if text is None else parse_point(text) for text in (meshes.from_, meshes.at))
+            size = meshes.width, meshes.height
+            made = picture_meshes(what, out, meshes.label, eye, target, *size, meshes.grey, progress)
+        elif frame is None:
+            refuse_options("a preview without --frame", {"--scene": scene})
+            made = preview_sequence(what[0], out, count or 4)
+        else:
+            refuse_options("one --frame", {"--count": count})
+            made = compare_frame(what[0], frame, out, scene, progress)
+    print(made)
     return 0
 
 

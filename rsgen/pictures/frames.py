@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import ByteArray, Float32Array
 from rsgen.config.config import Config, recorded_config
-from rsgen.console.progress import ProgressDisplay
+from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_yaml
 from rsgen.produce.frame_source import setting_of
@@ -50,7 +50,9 @@ def preview_sequence(path: Path, out: Path | None, count: int) -> Path:
     return out
 
 
-def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) -> Path:
+def compare_frame(
+    path: Path, frame: int, out: Path | None, scene: Path | None, progress: Progress = no_progress
+) -> Path:
     """Write the paper's Figure 3 for one frame: global shutter, rolling shutter, signed difference; returns its path.
 
     The global-shutter pictures are rendered at the time of the middle line. `scene` names the scene file if it is no
@@ -66,9 +68,8 @@ def compare_frame(path: Path, frame: int, out: Path | None, scene: Path | None) 
     config = config_of(path, sequence.meta, scene)
     if scene_hash(config) != _mapping(sequence.meta.get("inputs")).get("scene"):
         log.warning("%s: the scene %s has changed since, so more than the shutter differs", path, config.scene.file)
-    with ProgressDisplay() as progress:
-        things = [thing.spline for thing in sequence.objects]
-        source = open_frames(config, progress, global_shutter=True, objects=things)
+    things = [thing.spline for thing in sequence.objects]
+    source = open_frames(config, progress, global_shutter=True, objects=things)
     at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
     middle = {s.name: float(s.stamps[at[s.name]]) + s.shutter.readout_s / 2 for s in (color, depth)}
     setting = setting_of(config.color, color.table, at["color"])

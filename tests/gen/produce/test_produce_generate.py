@@ -95,7 +95,7 @@ def test_compare_needs_no_origin_if_the_scene_is_named(folder: Path, whole: Path
     origin = (whole / "origin.yaml").read_bytes()
     (whole / "origin.yaml").unlink()
     try:
-        words = ["preview", str(whole), "--frame", "0", "--out", str(tmp_path / "c.png")]
+        words = ["preview", str(whole), "--frame", "0", "--out", str(tmp_path / "c.png"), "--quiet"]
         assert main(words) == 2
         assert main([*words, "--scene", str(folder / "scene.xml")]) == 0
     finally:
