@@ -87,11 +87,7 @@ def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.
     if (fault := png_fault(data)) is not None:
         raise _damaged(path, "PNG", fault)
     _check_pixels(path, data, shape)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None:
+    if (image := decoded(data)) is None:
         raise _damaged(path, "PNG", "cannot be decoded")
     _expect(path, image, shape, dtype)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image
@@ -135,6 +131,14 @@ def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     if not np.isfinite(array).all():
         raise UserError(f"{path}: holds values that are not finite")
     return array
+
+
+def decoded(data: bytes) -> np.ndarray | None:
+    """A picture as OpenCV has it, of bytes without a fault; None where it cannot be decoded."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
 
 
 def png_fault(data: bytes) -> str | None:

@@ -21,7 +21,11 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rstrack.data.rig import Frame, Image, Rig
+from rstrack.options import Options
 from rstrack.peers.peer import run_command
+from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.spline_tracker import Tracker
 
 EXAMPLES = Path(__file__).parents[1] / "docs/examples"
 
@@ -113,6 +117,113 @@ def test_a_tracker_of_ones_own_in_the_bench(tmp_path: Path, monkeypatch: pytest.
     T, T_true = estimate.T_world_depth, synthetic.make_spline().pose(estimate.stamps)
     off, moved = errors(T, T_true), np.linalg.norm(T_true[:, :3, 3] - T_true[0, :3, 3], axis=1)
     assert len(T) == 8 and moved[-1] > 0.15 and off.max() < 0.2 * moved[-1]  # 12 % at 160 columns
+
+
+# --- the live loop by a clock of its own ------------------------------------------------------------------------------
+
+
+class Clock:
+    """Time passes where it is told to: as `time.perf_counter`, and `sleep` as `time.sleep`."""
+
+    now = 5.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds >= 0
+        self.now += seconds
+
+
+def queue_of_one(count: int, period: int, busy: list[int]) -> list[int]:
+    """What is taken, tick by tick: a frame a period, the waiting one replaced; the n-th taken needs busy[n] ticks."""
+    waiting: list[int] = []
+    taken: list[int] = []
+    free_at = 0
+    for tick in range(count * period + sum(busy)):
+        if tick % period == 0 and tick < count * period:
+            waiting = [tick // period]
+        if tick >= free_at and waiting:
+            free_at = tick + busy[len(taken)]
+            taken.append(waiting.pop())
+    return taken
+
+
+def test_one_frame_waits_and_a_newer_one_takes_its_place() -> None:
+    survivors, rng, dropped = load("live_loop").survivors, np.random.default_rng(2), 0
+    for _ in range(200):
+        count = int(rng.integers(1, 30))
+        busy = rng.integers(1, 32 * int(rng.integers(1, 5)), count).tolist()
+        clock, taken = Clock(), []
+        for n, arrived in survivors(count, 1 / 32, clock, clock.sleep):
+            assert arrived == 5.0 + 32 * n and clock() - arrived < max(busy)
+            clock.now += busy[len(taken)]
+            taken.append(n)
+        assert taken == queue_of_one(count, 32, busy)
+        dropped += count - len(taken)
+    assert dropped > 500
+
+
+def test_on_the_way_back_an_image_begins_where_it_ended() -> None:
+    played, rig = load("live_loop").played, Rig(CAMERA, Shutter(0.02), CAMERA, Shutter(0.03), np.eye(4))
+    pixels = np.zeros((1, 1))
+    frames = [
+        Frame(Image(t, pixels + 100 * t), (Image(t - 0.01, pixels), Image(t + 0.015, pixels + 1)))
+        for t in (2.0, 2.1, 2.25)
+    ]
+    shown = [played(frames, rig, n) for n in range(7)]
+    assert [round(float(f.depth.pixels[0, 0])) for f in shown] == [200, 210, 225, 210, 200, 210, 225]
+    np.testing.assert_allclose([f.depth.stamp for f in shown], [2.0, 2.1, 2.25, 2.4, 2.5, 2.6, 2.75])
+    # Mirrored in time about the middle of the last depth image: every line of every image.
+    about = 2 * (2.25 + 0.01)
+    forth, back = frames[1], shown[3]
+    assert back.depth.stamp + 0.02 == pytest.approx(about - forth.depth.stamp)
+    for image, mirrored in zip(forth.colors, reversed(back.colors), strict=True):
+        assert mirrored.stamp + 0.03 == pytest.approx(about - image.stamp) and mirrored.pixels is image.pixels
+
+
+CAMERA, SHUTTER = Camera(160, 120, 120.0, 120.0, 79.5, 59.5), Shutter(readout_s=0.028)
+
+
+def test_what_survives_the_clock_gives_the_same_bits_without_it() -> None:
+    truth, rig = synthetic.make_spline(0.3), Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, synthetic.T_COLOR_DEPTH)
+
+    def camera(n: int) -> Frame:
+        depth = synthetic.render_depth(truth, CAMERA, SHUTTER, n / 30)
+        color = synthetic.render_color(truth, CAMERA, SHUTTER, n / 30, synthetic.T_COLOR_DEPTH)
+        return Frame(Image(n / 30, depth), (Image(n / 30, color),))
+
+    class Slow(Tracker):
+        """Takes time of the clock: less than a frame's, and now and then two or three frames'."""
+
+        def feed(self, frame: Frame) -> FrameReport:
+            clock.now += (0.4, 0.9, 2.3, 0.5, 3.1, 0.2)[len(self.reports) % 6] / 30
+            return super().feed(frame)
+
+    clock, slow = Clock(), Slow(rig, Options(method="rs-pg"))
+    fed, latencies = load("live_loop").live(slow, camera, 20, 30.0, clock, clock.sleep)
+    assert len(slow.reports) == len(fed) < 16 and not any(report.lost for report in slow.reports)
+    assert latencies.max() == pytest.approx(3.1 / 30) and latencies.min() < 1 / 30
+
+    again, all_of_them = (Tracker(rig, Options(method="rs-pg")) for _ in range(2))
+    for n in range(20):
+        all_of_them.feed(camera(n))
+        if n in fed:
+            again.feed(camera(n))
+    splines = [t.spline.control_points for t in (slow, again, all_of_them) if t.spline is not None]
+    assert splines[0].tobytes() == splines[1].tobytes() != splines[2].tobytes()
+    for live, offline in zip(slow.trajectory, again.trajectory, strict=True):
+        assert live.tobytes() == offline.tobytes()
+
+
+def test_the_live_loop_says_what_it_dropped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, clock = synthetic.make_sequence(tmp_path / "seq", frames=6), Clock()
+    words = [str(root), "--method", "rs-g", "--seconds", "0.3", "--hz", "30", "--check"]
+    load("live_loop").main(words, clock, clock.sleep)
+    first, second, third = capsys.readouterr().out.splitlines()
+    assert first == "9 frames in 0.3 s: 9 fed, 0 dropped, 0 lost"
+    assert second.startswith("latency, ms: median 0.0, 95 % 0.0") and third.endswith("the same bits")
+    assert clock.now == pytest.approx(5.0 + 8 / 30)
 
 
 NOTEBOOK = EXAMPLES / "scene_to_table.ipynb"

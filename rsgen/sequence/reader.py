@@ -133,7 +133,7 @@ class Sequence:
 
     def depth(self, k: int) -> Float32Array:
         """Planar z (h, w) in metres that the sensor reports, 0 where nothing was measured."""
-        return (self.depth_units(k) / self.streams["depth"].depth_scale).astype(np.float32)
+        return np.asarray(self.depth_units(k) / np.float32(self.streams["depth"].depth_scale), np.float32)
 
     def truth_depth(self, k: int) -> Float32Array:
         """Exact planar z (h, w) in metres, noise-free, with the same rolling shutter; 0 where there is none."""

@@ -19,12 +19,11 @@ from rsgen.array_types import ByteArray, Float32Array
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry.camera import Camera
-from rsgen.image_codecs import png_fault
-from rsgen.inputs import MOST_PIXELS, image_size
+from rsgen.image_codecs import decoded, png_fault
+from rsgen.inputs import MOST_PIXELS, PNG_START, image_size
 from rstrack.data.rig import Frame, Image, Rig
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-PNG_START = b"\x89PNG\r\n\x1a\n"
 # Damaged images at the start of a recording before it is given up.
 _TRIED = 10
 # Repeats in a row beyond which a camera is taken to be at rest in a world without noise.
@@ -118,14 +117,6 @@ def image_fault(data: bytes) -> str | None:
         fault = "neither PNG nor JPEG"
     width, height = image_size(data) or (0, 0)
     return fault or (f"it claims {width}x{height} pixels" if width * height > MOST_PIXELS else None)
-
-
-def decoded(data: bytes) -> npt.NDArray[Any] | None:
-    """The image as OpenCV has it, of bytes without a fault; None where it cannot be decoded."""
-    try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
 
 
 def decode_color(path: Path) -> ByteArray:

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from rsgen.array_types import ByteArray
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
-from rsgen.image_codecs import encode_png, png_fault
-from rsgen.inputs import image_size
-from rstrack.data.image_files import PNG_START, decoded, image_fault
+from rsgen.image_codecs import decoded, encode_png, png_fault
+from rsgen.inputs import PNG_START, image_size
+from rstrack.data.image_files import image_fault
 from rstrack.formats.recording import FLOAT_DEPTH_SCALE
 
 # Bytes of `compressed_depth_image_transport` before the PNG: format, and two floats of the quantisation of 32FC1.

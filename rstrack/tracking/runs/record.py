@@ -74,7 +74,7 @@ def run_info(run: Run, closing: Closing | None, times: dict[str, float]) -> dict
         "segments": run.segments.info(),
         "loops": None if closing is None else closing.info(),
         "spline_valid": tracker.spline_valid,
-        "timings": timings(done.seconds) | times | ({} if closing is None else {"loops_s": closing.seconds}),
+        "timings": timings(done) | times | ({} if closing is None else {"loops_s": closing.seconds}),
         "frames": diagnostics(run.dataset, done.fed, reports, spread),
     }
     if run.dataset.timing is not None:
@@ -111,14 +111,16 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
     }  # fmt: skip
 
 
-def timings(seconds: Sequence[float]) -> dict[str, Any]:
-    """Of the tracker alone; the first frames compile kernels."""
-    ms = 1e3 * np.array(seconds)
+def timings(done: Done) -> dict[str, Any]:
+    """Of the tracker alone; the first frames compile kernels. wait_ms: that it waited for a frame's images, mean."""
+    ms, waits_ms = 1e3 * np.array(done.seconds), 1e3 * np.array(done.waited)
     return {
         "median_ms": float(np.median(ms)),
         "mean_ms": float(ms.mean()),
         "p95_ms": float(np.percentile(ms, 95)),
         "frame_ms": np.round(ms, 3),
+        "wait_ms": float(waits_ms.mean()),
+        "p99_wait_ms": float(np.percentile(waits_ms, 99)),
     }
 
 

@@ -141,7 +141,11 @@ def feed(run: Run, progress: Progress, watch: Watch | None, note: Note | None) -
     words, noted_at = "", 0
     begin = time.perf_counter() - done.total_s
     with _stop_flag() as stopped:
-        for k, (frame, problems) in zip(left, prefetched(run.load, left, 2), strict=True):
+        images = prefetched(run.load, left, 2)
+        for k in left:
+            asked = time.perf_counter()
+            frame, problems = next(images)
+            done.waited.append(time.perf_counter() - asked)
             done.unreadable += [(k, problem) for problem in problems]
             if frame is not None and (error := _feed_one(run, k, frame, watch)):
                 return "broke down", error

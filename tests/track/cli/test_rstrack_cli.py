@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args, get_type_hints
 
 import cv2
@@ -13,9 +15,12 @@ import pytest
 import synthetic
 from rstrack_command import FRAMES, make_seq, read_info, refused, run
 
+from rsgen.console.progress import no_progress
 from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
 from rstrack.options import METHODS, Options
+from rstrack.tracking.runs import run as run_module
+from rstrack.tracking.runs.done import Done
 
 COMMANDS = ("import", "info", "calibrate", "track", "refine", "evaluate", "report", "map", "export", "bench")
 
@@ -33,6 +38,23 @@ def without_times(folder: str) -> list[Any]:
     info = read_info(folder)
     del info["timings"]
     return [info, Path(folder, "trajectory.txt").read_bytes(), Path(folder, "spline.npz").read_bytes()]
+
+
+def test_the_time_that_frames_are_waited_for_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=5.0)
+
+    def slowly(load: Any, keys: range, ahead: int) -> Iterator[Any]:
+        for seconds in (0.1, 0.3):
+            clock.now += seconds
+            yield None, ("damaged",)
+
+    monkeypatch.setattr(run_module, "prefetched", slowly)
+    monkeypatch.setattr(run_module, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    idle: Any = SimpleNamespace(
+        done=Done(), chosen=range(2), load=None, tracker=SimpleNamespace(keyframes=0), checkpoint=None
+    )
+    assert run_module.feed(idle, no_progress, None, None) == ("done", "")
+    assert idle.done.waited == pytest.approx([0.1, 0.3]) and idle.done.count == 2
 
 
 # --- help ------------------------------------------------------------------------------------------------------------
@@ -131,7 +153,8 @@ def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, origina
     assert set(info["versions"]) == {"rstrack", "numpy", "scipy", "drjit"} and info["backend"] in ("llvm", "cuda")
     assert (info["end"], info["error"], info["lost"]) == ("done", None, 0) and info["keyframes"] >= 1
     times = info["timings"]
-    assert len(times["frame_ms"]) == FRAMES and times["total_s"] * 1e3 > sum(times["frame_ms"])
+    assert len(times["frame_ms"]) == FRAMES and 0.0 < times["wait_ms"] <= times["p99_wait_ms"]
+    assert times["total_s"] * 1e3 > sum(times["frame_ms"]) + FRAMES * times["wait_ms"]
     assert min(times["frame_ms"]) <= times["median_ms"] <= times["p95_ms"] <= max(times["frame_ms"])
     np.testing.assert_allclose([frame["stamp"] for frame in info["frames"]], estimate.stamps, atol=1e-9)
     for stream in ("depth", "color"):
