@@ -20,7 +20,7 @@ import numpy.typing as npt
 from rsgen.array_types import Float32Array, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.sequence.format import DEPTH_SCALE, StreamName
+from rsgen.sequence.format import DEPTH_SCALE
 from rsgen.sequence.reader import Sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, camera_content, run_cameras
@@ -211,13 +211,6 @@ class Dataset:
         if self.rig.color_falloff is not None or not isinstance(falloff, float | int):
             return timed
         return timed.with_color_falloff(float(falloff))
-
-    def rows(self, stream: StreamName) -> FloatArray | None:
-        """True poses (images, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world; None if not known.
-
-        Images are counted as in `stamps` and `color_stamps`; see `rsgen.sequence.Sequence.rows`. Raises UserError.
-        """
-        return None if self.sequence is None else self.sequence.rows(stream)
 
 
 def open_dataset(path: Path, camera_file: Path | None = None, imu_file: Path | None = None) -> Dataset:

@@ -49,8 +49,9 @@ def test_sequence_gives_images_cameras_and_truth(uneven: Path) -> None:
             i = int(np.flatnonzero(sequence.streams["color"].stamps == image.stamp)[0])
             np.testing.assert_array_equal(image.pixels, sequence.color(i))
     assert dataset.truth is not None and dataset.truth_poses is None
-    rows = dataset.rows("depth")
-    assert rows is not None and rows.shape == (9, rig.depth_camera.height, 7)
+    assert dataset.sequence is not None
+    rows = dataset.sequence.rows("depth")
+    assert rows.shape == (9, rig.depth_camera.height, 7)
     middle = rig.depth_shutter.line_mid_time(dataset.stamps[4], 20, rig.depth_camera)
     np.testing.assert_allclose(rows[4, 20, :3], dataset.truth.pose(middle)[:3, 3], atol=1e-9)
 

@@ -45,7 +45,7 @@ def test_tum_folder_with_colour_only_in_camera_yaml(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.depth.pixels, (depth_units(k) / 5000).astype(np.float32))
         np.testing.assert_array_equal(frame.colors[0].pixels, color_pixels(k))
         assert frame.depth.stamp == STAMPS[k] and frame.depth.pixels.dtype == np.float32
-    assert dataset.rows("color") is None
+    assert dataset.sequence is None
 
 
 def test_tum_folder_with_everything_told_and_truth_of_the_colour_camera(tmp_path: Path) -> None:
