@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.adjustment.candidates import AGREE, KeyframeTrack, candidates, sizes
 from rstrack.adjustment.graph import Sighting
 from rstrack.adjustment.rigid import Alignment, Judge, align
 from rstrack.alignment.linearise import Terms
@@ -24,26 +25,18 @@ from rstrack.keyframes.archive import Archive
 from rstrack.keyframes.keyframe import Reference
 from rstrack.options import Options
 
-# Keyframes that follow each other see the same; so many later another place may come back.
-_APART = 3
-# Of the distance and angle at which a keyframe is left: older ones within so many times these see much the same.
-_NEAR = 1.2
-# Older keyframes that each is aligned to at most, and how far apart these must be in their order.
-_MOST, _SPREAD = 3, 2
-# How far a track may have drifted: so many σ of its own, and a part of the way and of the turning since.
-_DRIFT_SIGMAS, _DRIFT_SHARE = 6.0, 0.02
 # Known better than this (m, rad), a place need not be searched for.
 _SURE = np.array([0.05, np.radians(3.0)])
-# How far the two ways of aligning a pair may differ, m at one metre and rad.
-_AGREE = np.array([0.01, np.radians(0.5)])
 # Error of an alignment that all pixels share, in pixels, see `Uncertainty`: of keyframes that saw a place from
 # elsewhere, not of the next frames.
 _SYSTEMATIC_PX = 0.02
-# Keyframes that are held on the device at once.
+# Keyframes that are held on the device at once, and as many frames.
 _HELD = 24
 # Levels of the pyramid from a place that is known well, and from one that was searched for.
 _NEARBY: tuple[int, ...] = (1, 0)
 _ANYWHERE: tuple[int, ...] = (2, 1, 0)
+
+Held = TypeVar("Held")
 
 
 @dataclass(frozen=True)
@@ -81,53 +74,33 @@ class LoopSearch:
     tried: int = 0
     faults: Counter[str] = field(default_factory=Counter)
     _references: OrderedDict[int, Reference] = field(default_factory=OrderedDict)
+    _frames: OrderedDict[int, DeviceFrame] = field(default_factory=OrderedDict)
 
     def find(self, progress: Progress = no_progress) -> list[Loop]:
         """All loops among the keyframes."""
-        order = sorted(self.archive.indices)
-        T, way = self._track(order)
-        number = {k: n for n, k in enumerate(order)}
-        halves: dict[int, list[tuple[int, Alignment]]] = {}
-        for n, late in enumerate(order):
-            frame = self.load(late)
-            for m in self._candidates(frame, n, order, T, way):
-                early = order[m]
-                allowed = self._allowed(early, late, way[n] - way[m])
-                found = self._aligned(frame, early, se3.inverse(T[early]) @ T[late], allowed)
-                if found is not None:
-                    halves.setdefault(early, []).append((late, found))
-            progress("loops", 0.7 * (n + 1) / len(order), f"{sum(map(len, halves.values()))} places again")
-        loops = []
-        for n, (early, found_there) in enumerate(halves.items()):
-            frame = self.load(early)
-            for late, there in found_there:
-                allowed = self._allowed(early, late, way[number[late]] - way[number[early]])
-                back = self._aligned(frame, late, se3.inverse(T[late]) @ T[early], allowed)
-                loop = None if back is None else self._loop(early, late, there, back)
-                if loop is not None:
-                    loops.append(loop)
-            progress("loops", 0.7 + 0.3 * (n + 1) / len(halves), f"{len(loops)} loops")
+        track = self._track(self.archive.indices)
+        loops: list[Loop] = []
+        for n in range(len(track.order)):
+            loops += self._loops_of(track, n)
+            progress("loops", (n + 1) / len(track.order), f"{len(loops)} loops")
         return loops
 
     def find_of(self, late: int) -> list[Loop]:
         """Loops from one keyframe to those before it."""
-        order = sorted(k for k in self.archive.indices if k <= late)
-        T, way = self._track(order)
-        n = len(order) - 1
-        frame = self.load(late)
-        loops = []
-        for m in self._candidates(frame, n, order, T, way):
-            early = order[m]
-            allowed = self._allowed(early, late, way[n] - way[m])
-            loop = self._pair(frame, early, late, se3.inverse(T[early]) @ T[late], allowed)
-            if loop is not None:
-                loops.append(loop)
-        return loops
+        track = self._track([k for k in self.archive.indices if k <= late])
+        return self._loops_of(track, len(track.order) - 1)
 
-    def _track(self, order: list[int]) -> tuple[dict[int, FloatArray], FloatArray]:
-        """Keyframes' poses, and metres and radians (n, 2) from the first to each along the way."""
-        T = {k: self.pose(k) for k in order}
-        return T, _ways([T[k] for k in order])
+    def _track(self, keyframes: list[int]) -> KeyframeTrack:
+        order = sorted(keyframes)
+        nothing = np.zeros((6, 6))
+        drift = np.array([self.drift.get(k, nothing) for k in order])
+        return KeyframeTrack(order, np.array([self.pose(k) for k in order]), drift)
+
+    def _loops_of(self, track: KeyframeTrack, n: int) -> list[Loop]:
+        late = track.order[n]
+        alike = self.archive.alike(self._frame(late), set(self.archive.indices).difference(track.older(n)))
+        found = [self.pair(c.early, late, c.T_early_late, c.allowed) for c in candidates(track, n, alike, self.options)]
+        return [loop for loop in found if loop is not None]
 
     def pose(self, keyframe: int) -> FloatArray:
         """T_world_base (4, 4)."""
@@ -136,14 +109,11 @@ class LoopSearch:
 
     def pair(self, early: int, late: int, T_early_late: FloatArray, allowed: FloatArray) -> Loop | None:
         """Whether two keyframes see one place, at T_early_late (4, 4) from each other, up to metres and radians."""
-        return self._pair(self.load(late), early, late, T_early_late, allowed)
-
-    def _pair(
-        self, frame: DeviceFrame, early: int, late: int, T_early_late: FloatArray, allowed: FloatArray
-    ) -> Loop | None:  # fmt: skip
-        there = self._aligned(frame, early, T_early_late, allowed)
-        back = None if there is None else self._aligned(self.load(early), late, se3.inverse(T_early_late), allowed)
-        return None if there is None or back is None else self._loop(early, late, there, back)
+        there = self._aligned(self._frame(late), early, T_early_late, allowed)
+        if there is None:
+            return None
+        back = self._back(self._frame(early), late, there, T_early_late, allowed)
+        return None if back is None else self._loop(early, late, there, back)
 
     def pair_across(self, other: LoopSearch, early: int, late: int, allowed: FloatArray) -> bool:
         """Whether a keyframe of this recording and one (`late`) of another by the same cameras are taken for one place.
@@ -151,55 +121,36 @@ class LoopSearch:
         Both are tried from where they were taken at one pose, up to metres and radians (2,).
         """
         here, there = replace(self, motion=other.motion), replace(other, motion=self.motion)
-        one = here._aligned(other.load(late), early, np.eye(4), allowed)
-        back = None if one is None else there._aligned(self.load(early), late, np.eye(4), allowed)
+        one = here._aligned(other._frame(late), early, np.eye(4), allowed)
+        back = None if one is None else there._back(self._frame(early), late, one, np.eye(4), allowed)
         return one is not None and back is not None and not self._differ(early, one, back)
-
-    def _candidates(
-        self, frame: DeviceFrame, n: int, order: list[int], T: dict[int, FloatArray], way: FloatArray
-    ) -> list[int]:
-        """Numbers in the order of older keyframes that may see what the nth sees, the most promising first."""
-        late = order[n]
-        alike = {k: rank for rank, k in enumerate(self.archive.alike(frame, set(order[max(0, n - _APART + 1) :])))}
-        rated = []
-        for m in range(n - _APART + 1):
-            early = order[m]
-            if early not in alike:
-                continue
-            T_rel = se3.inverse(T[early]) @ T[late]
-            remote = self.options.remoteness(T_rel)
-            allowed = self._allowed(early, late, way[n] - way[m])
-            # As near as the drift may have hidden.
-            hidden = self.options.remoteness(se3.exp(np.array([allowed[0], 0, 0, 0, 0, min(allowed[1], 1.0)])))
-            if remote < _NEAR or (remote < _NEAR + hidden and alike[early] < _MOST):
-                rated.append((remote, m))
-        chosen: list[int] = []
-        for _, m in sorted(rated):
-            if len(chosen) < _MOST and all(abs(m - other) >= _SPREAD for other in chosen):
-                chosen.append(m)
-        return chosen
-
-    def _allowed(self, early: int, late: int, way: FloatArray) -> FloatArray:
-        """Metres and radians by which a track may be off between two keyframes; way (2,): metres and radians since."""
-        nothing = np.zeros((6, 6))
-        spread = self.drift.get(late, nothing) - self.drift.get(early, nothing)
-        T_late = self.pose(late)
-        Ad = se3.adjoint(se3.inverse(T_late))
-        own = Ad @ spread @ Ad.T
-        sigma = np.sqrt(np.abs([np.trace(own[:3, :3]), np.trace(own[3:, 3:])]))
-        return np.asarray(_DRIFT_SIGMAS * sigma + _DRIFT_SHARE * way + _AGREE)
 
     def _aligned(
         self, frame: DeviceFrame, at: int, T_expected: FloatArray, allowed: FloatArray
     ) -> Alignment | None:  # fmt: skip
         """A frame against the keyframe `at`, if it is found there, no further off than is allowed (m, rad)."""
-        self.tried += 1
-        ref = self._reference(at)
         start, levels = T_expected, _NEARBY
         if (allowed > _SURE).any():
             small = coarse_search.small_frame(frame, self.rig, self.options.geometric)
-            found, score = coarse_search.search(small, coarse_search.small_keyframe(ref), T_expected[None])
+            keyframe = coarse_search.small_keyframe(self._reference(at))
+            found, score = coarse_search.search(small, keyframe, T_expected[None])
             start, levels = (found if score > 0.0 else T_expected), _ANYWHERE
+        return self._aligned_from(start, levels, frame, at, T_expected, allowed)
+
+    def _back(
+        self, frame: DeviceFrame, at: int, there: Alignment, T_expected: FloatArray, allowed: FloatArray
+    ) -> Alignment | None:  # fmt: skip
+        """The other way round, other images from the place that was found: it is to hold for these too."""
+        return self._aligned_from(
+            se3.inverse(there.T_ref_cam), _NEARBY, frame, at, se3.inverse(T_expected), allowed
+        )  # fmt: skip
+
+    def _aligned_from(
+        self, start: FloatArray, levels: Sequence[int], frame: DeviceFrame, at: int, T_expected: FloatArray,
+        allowed: FloatArray,
+    ) -> Alignment | None:  # fmt: skip
+        self.tried += 1
+        ref = self._reference(at)
         if ref.pixels == 0:
             self._refuse("a keyframe without depth")
             return None
@@ -209,7 +160,7 @@ class LoopSearch:
         if result.fault:
             self._refuse(result.fault)
             return None
-        if (_sizes(se3.inverse(T_expected) @ result.T_ref_cam) > allowed).any():
+        if (sizes(se3.inverse(T_expected) @ result.T_ref_cam) > allowed).any():
             self._refuse("further off than the track may have drifted")
             return None
         return result
@@ -218,7 +169,7 @@ class LoopSearch:
         if self._differ(early, there, back):
             self._refuse("the two ways of aligning it differ")
             return None
-        between = _sizes(there.T_ref_cam @ back.T_ref_cam)
+        between = sizes(there.T_ref_cam @ back.T_ref_cam)
         # Their difference shows more of their errors than either's noise.
         off = se3.log(there.T_ref_cam @ back.T_ref_cam)
         Ad = se3.adjoint(there.T_ref_cam)
@@ -238,7 +189,7 @@ class LoopSearch:
 
     def _differ(self, early: int, there: Alignment, back: Alignment) -> bool:
         depth = max(1.0, self._reference(early).median_depth)
-        return bool((_sizes(there.T_ref_cam @ back.T_ref_cam) > _AGREE * np.array([depth, 1.0])).any())
+        return bool((sizes(there.T_ref_cam @ back.T_ref_cam) > AGREE * np.array([depth, 1.0])).any())
 
     def _covariance(self, found: Alignment) -> FloatArray:
         turn = _SYSTEMATIC_PX / self.rig.depth_camera.fx
@@ -255,23 +206,20 @@ class LoopSearch:
         return self.archive.small(keyframe).t
 
     def _reference(self, index: int) -> Reference:
-        if index not in self._references:
-            self._references[index] = self.archive.get(index)
-        self._references.move_to_end(index)
-        while len(self._references) > _HELD:
-            self._references.popitem(last=False)
-        return self._references[index]
+        return _held(self._references, index, self.archive.get)
+
+    def _frame(self, index: int) -> DeviceFrame:
+        return _held(self._frames, index, self.load)
 
     def _refuse(self, why: str) -> None:
         self.faults[why] += 1
 
 
-def _sizes(T: FloatArray) -> FloatArray:
-    """Metres and radians of a motion (4, 4)."""
-    return np.linalg.norm(se3.log(T).reshape(2, 3), axis=1)
-
-
-def _ways(poses: list[FloatArray]) -> FloatArray:
-    """Metres and radians (n, 2) from the first pose to each, along all between."""
-    steps = [_sizes(se3.inverse(a) @ b) for a, b in pairwise(poses)]
-    return np.cumsum(np.array([np.zeros(2), *steps]), axis=0)
+def _held(held: OrderedDict[int, Held], index: int, make: Callable[[int], Held]) -> Held:
+    """What is held under a number, made where it is not, in place of what was asked for longest ago."""
+    if index not in held:
+        held[index] = make(index)
+    held.move_to_end(index)
+    while len(held) > _HELD:
+        held.popitem(last=False)
+    return held[index]

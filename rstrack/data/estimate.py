@@ -119,8 +119,19 @@ def write_estimate(
 
 
 def write_info(folder: Path, info: dict[str, Any]) -> None:
-    """A run folder's run.json; what is not finite becomes null. Raises UserError."""
-    atomic_write(folder / INFO, (json.dumps(plain(info), indent=1, allow_nan=False) + "\n").encode())
+    """A run folder's run.json; what is not finite becomes null. Raises UserError.
+
+    A line for each entry, and for each of those that have lists of their own, as of frames: json's indentation takes
+    seconds for a minute's frames.
+    """
+    entries = [f" {json.dumps(name)}: {_entry(value)}" for name, value in plain(info).items()]
+    atomic_write(folder / INFO, ("{\n" + ",\n".join(entries) + "\n}\n").encode())
+
+
+def _entry(value: Any) -> str:
+    if isinstance(value, list) and any(isinstance(item, dict) for item in value):
+        return "[\n  " + ",\n  ".join(json.dumps(item, allow_nan=False) for item in value) + "\n ]"
+    return json.dumps(value, allow_nan=False)
 
 
 def write_poses(file: Path, stamps: FloatArray, T_world_depth: FloatArray, name: str = "T_world_depth") -> None:
@@ -176,7 +187,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        known = value.dtype.kind in "bi" or (value.dtype.kind == "f" and np.isfinite(value).all())
+        return value.tolist() if known else plain(value.tolist())
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, float):

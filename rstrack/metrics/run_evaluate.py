@@ -132,15 +132,15 @@ def add_errors(run: Path, truth: Truth | None, estimate: Estimate, online: Estim
 
     online: the track before it was corrected. Raises UserError.
     """
-    evaluation, before = evaluated(truth, estimate), None if online is None else evaluated(truth, online)
+    evaluation, before = evaluated(truth, estimate), None if online is None else _metrics(truth, online)
     errors: dict[str, Any] = {
         "metrics": None if evaluation is None else evaluation.metrics.as_dict(),
         "truth_offset": None if evaluation is None else evaluation.truth_offset,
     }
     if online is not None:
-        errors["metrics_online"] = None if before is None else before.metrics.as_dict()
+        errors["metrics_online"] = None if before is None else before.as_dict()
     write_info(run, estimate.info | errors)
-    lines = [] if before is None else [f"ATE before loops were closed: {1e3 * before.metrics.ate_rmse_m:.3f} mm"]
+    lines = [] if before is None else [f"ATE before loops were closed: {1e3 * before.ate_rmse_m:.3f} mm"]
     return "\n".join(lines if evaluation is None else [*lines, "", evaluation.text()])
 
 
@@ -148,6 +148,14 @@ def evaluated(truth: Truth | None, estimate: Estimate) -> RunEvaluation | None:
     """`evaluate_clocks`; None without a truth, and where fewer than three poses have a true counterpart."""
     try:
         return None if truth is None else evaluate_clocks(truth, estimate)
+    except UserError:
+        return None
+
+
+def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
+    """`evaluate` with the clocks as they are; None as `evaluated`."""
+    try:
+        return None if truth is None else evaluate(truth, estimate)
     except UserError:
         return None
 

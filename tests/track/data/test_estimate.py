@@ -10,7 +10,7 @@ from estimates import FRAMES, SPLINE, one_line, rows_of, walk
 
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rstrack.data.estimate import Estimate, read_estimate, write_estimate
+from rstrack.data.estimate import Estimate, read_estimate, read_info, write_estimate, write_info
 
 
 def test_a_run_folder_comes_back_as_it_was(tmp_path: Path) -> None:
@@ -28,6 +28,23 @@ def test_a_run_folder_comes_back_as_it_was(tmp_path: Path) -> None:
     assert (back.spline.t0, back.spline.dt) == (spline.t0, spline.dt)
     assert back.info == {"method": "rs_pg", "sigma": None, "frames": [{"stamp": stamps[0], "keyframe": True}]}
     assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["run.json", "spline.npz", "trajectory.txt"]
+
+
+def test_run_json_has_a_line_for_each_frame_and_null_for_what_is_not_finite(tmp_path: Path) -> None:
+    frames = [
+        {"covariance": np.float32([0.5, bad]), "pixels": np.arange(2), "fit": (0.25, bad)} for bad in (1.0, np.inf)
+    ]
+    write_info(tmp_path, {"frames": frames, "empty": [], "pairs": np.array([[1.0, np.nan]])})
+    lines = (tmp_path / "run.json").read_text().splitlines()
+    assert len(lines) == 8 and sum("pixels" in line for line in lines) == 2
+    assert read_info(tmp_path / "run.json") == {
+        "frames": [
+            {"covariance": [0.5, 1.0], "pixels": [0, 1], "fit": [0.25, 1.0]},
+            {"covariance": [0.5, None], "pixels": [0, 1], "fit": [0.25, None]},
+        ],
+        "empty": [],
+        "pairs": [[1.0, None]],
+    }
 
 
 def test_a_run_without_spline_leaves_none_of_the_run_before(tmp_path: Path) -> None:
