@@ -17,7 +17,7 @@ from rsgen.geometry import so3
 from rsgen.geometry.so3 import coefficients, cross, exp_coefficients, hat
 
 # Power series of c1..c4 in theta^2; see so3.coefficients for where they replace the closed forms.
-_C_SERIES = np.array(
+CORNER_SERIES = np.array(
     [
         [
             (-1.0) ** (k + 1) * (k - 1) / math.factorial(2 * k + 2),
@@ -154,7 +154,7 @@ def _upper_blocks(diagonal: FloatArray, corner: FloatArray) -> FloatArray:
 def _jacobian_corner(xi: FloatArray) -> FloatArray:
     """Top-right block Q (..., 3, 3) of the left Jacobian: Σ c_k times the top-right blocks of ad^k."""
     theta2 = so3.squared_norm(xi[..., 3:])
-    c = coefficients(theta2, _C_SERIES, _corner_coefficients)[..., None, None, :]
+    c = coefficients(theta2, CORNER_SERIES, _corner_coefficients)[..., None, None, :]
     rho_hat, phi_hat, phi_hat2 = hat(xi[..., :3]), hat(xi[..., 3:]), so3.hat_squared(xi[..., 3:])
     # ad^(k+1) = ad ad^k: corner_(k+1) = phi^ corner_k + rho^ phi^^k, and phi^³ = −θ² phi^.
     corner2 = phi_hat @ rho_hat + rho_hat @ phi_hat

@@ -21,9 +21,9 @@ from rsgen.array_types import FloatArray
 _SERIES_BELOW = 1.0
 
 # sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³: sum_k (−1)^k θ^2k / (2k + 1)!, … / (2k + 2)!, … / (2k + 3)!
-_EXP_SERIES = np.array([[(-1.0) ** k / math.factorial(2 * k + n) for n in (1, 2, 3)] for k in range(10)])
+EXP_SERIES = np.array([[(-1.0) ** k / math.factorial(2 * k + n) for n in (1, 2, 3)] for k in range(10)])
 # sum_n |B_2n| theta^(2n - 2) / (2n)!  =  (1 - theta/2 cot theta/2) / theta^2;  |B_2n| / (2n)! = 2 zeta(2n) / (2 pi)^2n
-_D_SERIES = np.array([[2.0 * float(zeta(2 * n)) / (2.0 * math.pi) ** (2 * n)] for n in range(1, 12)])
+INVERSE_SERIES = np.array([[2.0 * float(zeta(2 * n)) / (2.0 * math.pi) ** (2 * n)] for n in range(1, 12)])
 
 
 def coefficients(
@@ -66,7 +66,7 @@ def exp_coefficients(theta2: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     """sin θ / θ, (1 − cos θ) / θ² and (θ − sin θ) / θ³ of squared angles (...,)."""
     # 2 sin²(θ/2) is 1 − cos θ free of cancellation.
     found = coefficients(
-        theta2, _EXP_SERIES, lambda x: (np.sin(x) / x, 2.0 * (np.sin(0.5 * x) / x) ** 2, (x - np.sin(x)) / x**3)
+        theta2, EXP_SERIES, lambda x: (np.sin(x) / x, 2.0 * (np.sin(0.5 * x) / x) ** 2, (x - np.sin(x)) / x**3)
     )
     return found[..., 0], found[..., 1], found[..., 2]
 
@@ -140,7 +140,7 @@ def left_jacobian(phi: npt.ArrayLike) -> FloatArray:
 def left_jacobian_inv(phi: npt.ArrayLike) -> FloatArray:
     """Inverse left Jacobians (..., 3, 3) of rotation vectors (..., 3), |phi| < 2π."""
     phi = np.asarray(phi, dtype=np.float64)
-    d = coefficients(squared_norm(phi), _D_SERIES, lambda x: [(1.0 - 0.5 * x / np.tan(0.5 * x)) / (x * x)])
+    d = coefficients(squared_norm(phi), INVERSE_SERIES, lambda x: [(1.0 - 0.5 * x / np.tan(0.5 * x)) / (x * x)])
     return polynomial(phi, -0.5, d[..., 0])
 
 

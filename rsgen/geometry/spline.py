@@ -28,7 +28,7 @@ Side = Literal["left", "right"]
 _BASIS = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0, 1.0]]).T / 6.0
 # Its derivatives by u, of orders 0, 1, 2: of powers (..., 4) by powers.
 _BY_U = np.diag([1.0, 2.0, 3.0], 1)
-_BASES = _BASIS, _BY_U @ _BASIS, _BY_U @ _BY_U @ _BASIS
+BASES = _BASIS, _BY_U @ _BASIS, _BY_U @ _BY_U @ _BASIS
 _ORTHONORMAL_WITHIN = 1e-6
 # Times evaluated at once: intermediate results then stay in the cache, which halves the time of large batches.
 _BLOCK = 4096
@@ -71,30 +71,12 @@ class Spline:
                 f"spline: control point {int(np.argmax(bad))} is not a rigid motion; pass it through se3.orthonormalise"
             )
 
-    def changed(self, first: int, points: FloatArray) -> Spline:
-        """The spline with control points `points` (n, 4, 4) from number `first` on; they may go beyond the end.
-
-        Derives anew only what the change touches, however long the spline is; points are trusted to be rigid.
-        """
-        first -= self.first
-        last = first + len(points)
-        every = np.concatenate([self.control_points[:first], points, self.control_points[last:]])
-        pairs = slice(max(0, first - 1), min(last, len(every) - 1))
-        before, after = every[pairs], every[pairs.start + 1 : pairs.stop + 1]
-        fresh = se3.log(se3.inverse(before) @ after)
-        gains = se3.left_jacobian_inv(fresh) @ se3.adjoint(se3.inverse(before))
-        derived = [
-            np.concatenate([old[: pairs.start], new, old[pairs.stop :]])
-            for old, new in ((self.increments, fresh), (self.left_gains, gains))
-        ]
-        return self._derived(self.first, every, *derived)
-
     def tail(self, first: int) -> Spline:
         """The spline from control point number `first` on, with what has been derived from it."""
         at = first - self.first
-        return self._derived(first, self.control_points[at:].copy(), self.increments[at:], self.left_gains[at:])
+        return self.with_derived(first, self.control_points[at:].copy(), self.increments[at:], self.left_gains[at:])
 
-    def _derived(self, first: int, points: FloatArray, increments: FloatArray, left_gains: FloatArray) -> Spline:
+    def with_derived(self, first: int, points: FloatArray, increments: FloatArray, left_gains: FloatArray) -> Spline:
         """One with the same knots, of which all is known and nothing need be checked."""
         twin = object.__new__(Spline)
         points.setflags(write=False)
@@ -149,16 +131,16 @@ class Spline:
             return out.reshape(*t.shape, 4, 4)
         segment, u = self._held(t)
         T = self.control_points[segment]
-        for A in self._factors(segment, powers(u, 4) @ _BASES[0]):
+        for A in self._factors(segment, powers(u, 4) @ BASES[0]):
             T = T @ A
         return T
 
     def pose_and_velocity(self, t: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """`pose` (..., 4, 4) and `velocity` (..., 6) at once, for the price of one and a half."""
         segment, u = self._held(t)
-        db = powers(u, 4) @ _BASES[1] / self.dt
+        db = powers(u, 4) @ BASES[1] / self.dt
         T, w = self.control_points[segment], np.zeros((*u.shape, 6))
-        for j, A in enumerate(self._factors(segment, powers(u, 4) @ _BASES[0])):
+        for j, A in enumerate(self._factors(segment, powers(u, 4) @ BASES[0])):
             T = T @ A
             # Ad(A⁻¹) [v; ω] = [Rᵀ (v − t × ω); Rᵀ ω]: rows times R, without the 6x6.
             R, t_ = A[..., :3, :3], A[..., :3, 3]
@@ -188,7 +170,7 @@ class Spline:
         T(t) ← exp(η) T(t) with η = Σ J_i δ_i (and Σ J_i = I); side "right": the same with increments on the right.
         """
         segment, u = self._held(t)
-        b = powers(u, 4) @ _BASES[0]
+        b = powers(u, 4) @ BASES[0]
         blocks = self._left_blocks(segment, b) if side == "left" else self._right_blocks(segment, b)
         return segment + self.first, np.stack(blocks, axis=-3)
 
@@ -219,9 +201,9 @@ class Spline:
 
     def _motion(self, t: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         segment, u = self._held(t)
-        b = powers(u, 4) @ _BASES[0]
-        db = powers(u, 4) @ _BASES[1] / self.dt
-        ddb = powers(u, 4) @ _BASES[2] / self.dt**2
+        b = powers(u, 4) @ BASES[0]
+        db = powers(u, 4) @ BASES[1] / self.dt
+        ddb = powers(u, 4) @ BASES[2] / self.dt**2
         w, dw = np.zeros((*u.shape, 6)), np.zeros((*u.shape, 6))
         for j, A in enumerate(self._factors(segment, b)):
             omega = self.increments[segment + j]

@@ -15,11 +15,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, cross
 from rstrack.alignment.weights import cost, curvature, weight
+from rstrack.images.fast_se3 import compiled
 
 # Blocks of lines that share one linearisation by the control points: half of a millisecond (eight of 480 lines lose
 # nothing).
@@ -85,37 +86,65 @@ class Scaling:
     bound: float
     capacity: int
 
-    def parameters(self, sigma: float, gate: float) -> FloatArray:
-        """What a kernel takes: 1/σ, gate (in units of r), 1/median_depth, bound, units of H, of g, of the cost sums."""
+    @property
+    def units(self) -> tuple[float, float, float]:
+        """Of H, of g and of the cost sums."""
         room = 2.0**30 / self.capacity
         # The largest weight is 1.2, the largest w |s| 1.35. The cost passes 16 at |s| = 32 but twice that only at 460.
-        units = room / (1.2 * self.bound**2), room / (1.4 * self.bound), room / 16.0
-        return np.array([1 / sigma, gate, 1 / self.median_depth, self.bound, *units])
+        return room / (1.2 * self.bound**2), room / (1.4 * self.bound), room / 16.0
 
-    def unpack(self, raw: FloatArray, current: int, reference: int, columns: int = 0) -> BlockSums:
+    def parameters(self, sigma: float, gate: float, *more: float) -> FloatArray:
+        """What a kernel takes: 1/σ, gate (in units of r), 1/median_depth, bound, the units, and more of its own."""
+        return np.array([1 / sigma, gate, 1 / self.median_depth, self.bound, *self.units, *more])
+
+    def unpack(self, raw: IntArray, current: int, reference: int, columns: int = 0) -> BlockSums:
         """Integers as summed on the device, with so many further columns, to `BlockSums`."""
-        raw = raw.reshape(current, reference, -1)
-        _, _, _, _, unit_H, unit_g, unit_cost = self.parameters(1.0, 0.0)
-        scale = np.array([1.0, 1.0, 1.0, self.median_depth, self.median_depth, self.median_depth])
-        H = np.empty((current, reference, 6, 6))
-        a, b = _UPPER
-        H[..., a, b] = H[..., b, a] = raw[..., :21] * (scale[a] * scale[b] / unit_H)
-        g = raw[..., 21:27] * (scale / unit_g)
-        weighted, cost, count, compared = raw[..., 27:31].astype(np.int64).sum(axis=(0, 1)).tolist()
-        more = self._columns(raw, scale, columns) if columns else None
+        H, g, totals, own, coupling = _unpacked(
+            raw.reshape(current, reference, -1), self.median_depth, self.bound, self.units, columns
+        )
+        weighted, cost, count, compared = totals.tolist()
+        unit_H, unit_g, unit_cost = self.units
+        more = None
+        if columns:
+            # c is summed in units of `bound`, so that the same units serve.
+            own_H, own_g = own[:-columns], own[-columns:]
+            full = np.empty((columns, columns))
+            a, b = np.triu_indices(columns)
+            full[a, b] = full[b, a] = own_H / (unit_H * self.bound**2)
+            more = ColumnSums(coupling, full, own_g / (unit_g * self.bound))
         return BlockSums(H, g, weighted / unit_cost, cost / unit_cost, count, compared, more)
 
-    def _columns(self, raw: FloatArray, scale: FloatArray, n: int) -> ColumnSums:
-        _, _, _, _, unit_H, unit_g, _ = self.parameters(1.0, 0.0)
-        own = _SLOTS + 6 * n
-        # c is summed in units of `bound`, so that the same units serve.
-        coupling = raw[..., _SLOTS:own].reshape(*raw.shape[:2], n, 6).swapaxes(2, 3)
-        summed = raw[..., own : own + n * (n + 1) // 2 + n].astype(np.int64).sum(axis=(0, 1))
-        H = np.empty((n, n))
-        a, b = np.triu_indices(n)
-        H[a, b] = H[b, a] = summed[: len(a)] / (unit_H * self.bound**2)
-        coupling = coupling * (scale[:, None] / (unit_H * self.bound))
-        return ColumnSums(coupling, H, summed[len(a) :] / (unit_g * self.bound))
+
+@compiled
+def _unpacked(raw: Any, median_depth: Any, bound: Any, units: Any, n: Any) -> Any:
+    """H, g and coupling of each block, and the sums over blocks of what follows g and of what follows the coupling."""
+    blocks, others, _ = raw.shape
+    unit_H, unit_g, _ = units
+    H, g = np.empty((blocks, others, 6, 6)), np.empty((blocks, others, 6))
+    coupling = np.empty((blocks, others, 6, n))
+    totals, own = np.zeros(4, np.int64), np.zeros(n * (n + 1) // 2 + n, np.int64)
+    scale = np.ones(6)
+    scale[3:] = median_depth
+    for b in range(blocks):
+        for r in range(others):
+            one = raw[b, r]
+            k = 0
+            for i in range(6):
+                for j in range(i, 6):
+                    H[b, r, i, j] = H[b, r, j, i] = one[k] * (scale[i] * scale[j] / unit_H)
+                    k += 1
+            for i in range(6):
+                g[b, r, i] = one[k + i] * (scale[i] / unit_g)
+            for i in range(4):
+                totals[i] += one[k + 6 + i]
+            k += 10
+            for c in range(n):
+                for i in range(6):
+                    coupling[b, r, i, c] = one[k + 6 * c + i] * (scale[i] / (unit_H * bound))
+            k += 6 * n
+            for i in range(len(own)):
+                own[i] += one[k + i]
+    return H, g, totals, own, coupling
 
 
 def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:

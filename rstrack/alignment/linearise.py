@@ -6,7 +6,7 @@ is eliminated, and σ is estimated anew.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -20,7 +20,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.brightness import SAME, SIGMA, contrast
-from rstrack.alignment.normal_equations import Eliminated, Quadratic, Slopes, chain, eliminate, prepare_jacobians
+from rstrack.alignment.normal_equations import Eliminated, Quadratic, Slopes, chain, eliminate
 from rstrack.alignment.residuals import (
     WHOLE,
     GeometricInput,
@@ -40,7 +40,8 @@ from rstrack.alignment.weights import (
     scale_step,
 )
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
-from rstrack.images.line_poses import Exposure, from_base, prepare, to_base
+from rstrack.images.fast_se3 import compiled
+from rstrack.images.line_poses import Exposure, from_base, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Points, Reference, pyramid_level, strides
 from rstrack.options import Options
@@ -94,8 +95,24 @@ class Linearised:
 
     def row_shift(self, increments: FloatArray, focal: float, depth: float) -> float:
         """Largest movement of a block in pixels under increments (k, 6) of the model's control points."""
-        twist = self.motion @ increments.ravel()
-        return float((focal * (np.abs(twist[:, :3]).max(axis=1) / depth + np.abs(twist[:, 3:]).max(axis=1))).max())
+        return float(_row_shift(self.motion, increments.ravel(), focal, focal / depth))
+
+
+@compiled
+def _row_shift(motion: Any, increments: Any, of_turn: Any, of_shift: Any) -> Any:
+    most = 0.0
+    twist = np.empty(6)
+    for block in motion:
+        for i in range(6):
+            total = 0.0
+            for k in range(len(increments)):
+                total += block[i, k] * increments[k]
+            twist[i] = abs(total)
+        shift = of_shift * max(twist[0], twist[1], twist[2]) + of_turn * max(twist[3], twist[4], twist[5])
+        # Not a number is further than any.
+        if not shift <= most:
+            most = shift
+    return most
 
 
 # A linearisation whose kernel runs: calling it waits for the sums and chains them. What does not need them is done
@@ -137,19 +154,6 @@ class Terms:
             counts_rough=not options.photometric, timer=device.timer,
         )  # fmt: skip
 
-    def expect(
-        self, spline: Spline, images: Sequence[DepthImage | ColorImage], slopes_at: Sequence[tuple[Spline, Reference]]
-    ) -> None:  # fmt: skip
-        """These images are linearised next, at this spline, with slopes at others and against these references: what is
-        needed of their lines is worked out together."""
-        with self.timer("poses of lines"):
-            prepare(spline, [image.exposure for image in images])
-            times: dict[Spline, list[FloatArray]] = {}
-            for image, (at, ref) in zip(images, slopes_at, strict=True):
-                times.setdefault(at, []).append(_block_times(image.exposure, ref))
-            for at, wanted in times.items():
-                prepare_jacobians(at, wanted)
-
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
         slopes_at: Spline | None = None,
@@ -171,7 +175,7 @@ class Terms:
             larger = max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2
             smooth = self.smooth * max(sigma, FLOOR_DEPTH * larger)
             rough = min(1.0, larger - 1.0) if self.counts_rough else 0.0
-            constants = e.upload(np.append(scaling.parameters(sigma, gate), [smooth, rough]))
+            constants = e.upload(scaling.parameters(sigma, gate, smooth, rough))
             surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
             raw = kernel(GeometricInput(image.z, *self.rays, poses[0], *surface, poses[1], constants))
         slopes = self._slopes(slopes_at or spline, image.exposure, ref)
@@ -210,7 +214,7 @@ class Terms:
             seen_at, seen_from = self._to_base(spline, ref, ref.rolling), self._from_base(spline, ref, image.exposure)
             # Moving closer or turning packs more points into a block than its share.
             scaling = self._scaling(points, lens, ref.lens.camera, ref, stride, 4)
-            constants = e.upload(np.append(scaling.parameters(sigma, self.gate_intensity), brightness))
+            constants = e.upload(scaling.parameters(sigma, self.gate_intensity, *brightness))
             at = points.x, points.y, points.z, points.intensity, points.visible if visible is None else visible
             raw = kernel(PhotometricInput(*at, seen_at, image.levels[own_level], seen_from, constants))
         slopes = self._slopes(slopes_at or spline, image.exposure, ref)

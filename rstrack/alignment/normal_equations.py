@@ -7,9 +7,10 @@ Unknowns are left increments δ_i in se(3): T_i ← exp(δ_i) T_i in the world f
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -18,7 +19,8 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
-from rstrack.images.line_poses import SplineCache
+from rstrack.images.fast_se3 import compiled
+from rstrack.images.fast_spline import jacobians
 
 
 @dataclass(frozen=True)
@@ -41,36 +43,13 @@ class Quadratic:
     def moved(self, increments: FloatArray) -> Quadratic:
         """The same model around a state that has been moved by increments (k, 6) of its control points."""
         step = increments.ravel()
-        return replace(self, g=self.g + self.H @ step) if step.any() else self
-
-
-_jacobians: SplineCache[bytes, tuple[IntArray, FloatArray]] = SplineCache()
-
-
-def prepare_jacobians(spline: Spline, times: Iterable[FloatArray]) -> None:
-    """Work out what `line_jacobian` of several images' times (n,) needs at once."""
-
-    def work_out(new: list[bytes]) -> Iterator[tuple[IntArray, FloatArray]]:
-        given = [np.frombuffer(t) for t in new]
-        first, J = spline.pose_jacobian(np.concatenate(given))
-        ends = np.cumsum([len(t) for t in given])[:-1]
-        return zip(np.split(first, ends), np.split(J, ends), strict=True)
-
-    _jacobians.add(spline, (t.tobytes() for t in times), work_out)
-
-
-def line_jacobian(spline: Spline, T_world_base: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:
-    """η in the base frame by the control points first..first+count: (n, 6, 6 count)."""
-    return _line_jacobian(spline, T_world_base.tobytes(), times.tobytes(), first, count)
+        return Quadratic(self.first, self.H, self.g + self.H @ step) if step.any() else self
 
 
 @lru_cache(maxsize=64)
-def _line_jacobian(spline: Spline, T_world_base: bytes, times: bytes, first: int, count: int) -> FloatArray:
+def _line_jacobian(spline: Spline, T_base_world: bytes, times: bytes, first: int, count: int) -> FloatArray:
     """Remembered, because both terms and all iterations of a level ask for the same."""
-    prepare_jacobians(spline, [np.frombuffer(times)])
-    at, J = _jacobians.of(spline)[times]
-    J = se3.adjoint(se3.inverse(np.frombuffer(T_world_base).reshape(4, 4))) @ J
-    return by_points(at, J, first, count)
+    return jacobians(spline, np.frombuffer(T_base_world).reshape(4, 4), np.frombuffer(times), first, count)
 
 
 def by_points(at: IntArray, J: FloatArray, first: int, count: int) -> FloatArray:
@@ -95,11 +74,13 @@ class Slopes:
     def of(cls, spline: Spline, T_world_base: FloatArray, times: FloatArray, ref_times: FloatArray | None) -> Slopes:
         """Blocks at `times` (n,) and, of a rolling reference, at `ref_times`."""
         every = times if ref_times is None else np.concatenate([times, ref_times])
-        segments, _ = spline.locate(every)
-        first, count = int(segments.min()), int(segments.max() - segments.min()) + 4
-        current = line_jacobian(spline, T_world_base, times, first, count)
-        reference = None if ref_times is None else line_jacobian(spline, T_world_base, ref_times, first, count)
-        return cls(first, current, reference)
+        segments, _ = spline.locate([every.min(), every.max()])
+        first, count = int(segments[0]), int(segments[1] - segments[0]) + 4
+        T_base_world = se3.inverse(T_world_base).tobytes()
+        current = _line_jacobian(spline, T_base_world, times.tobytes(), first, count)
+        if ref_times is None:
+            return cls(first, current, None)
+        return cls(first, current, _line_jacobian(spline, T_base_world, ref_times.tobytes(), first, count))
 
 
 def chain(sums: BlockSums, slopes: Slopes, coupling: FloatArray | None = None) -> tuple[Quadratic, FloatArray]:
@@ -147,11 +128,27 @@ def eliminate(
     coupling (m, n), own (n, n), own_g (n,): theirs with the others and among themselves. sigma (n,): the prior's; off
     (n,): how far from its mean they are.
     """
-    system = own + np.diag(1.0 / sigma**2)
-    solved = -np.asarray(np.linalg.solve(system, np.column_stack([own_g + off / sigma**2, coupling.T])))
-    step, follow = solved[:, 0], solved[:, 1:]
-    reduced = H + coupling @ follow
-    return Eliminated(0.5 * (reduced + reduced.T), g + coupling @ step, step, follow)
+    return Eliminated(*_eliminated(H, g, coupling, own, own_g, sigma, off))
+
+
+@compiled
+def _eliminated(H: Any, g: Any, coupling: Any, own: Any, own_g: Any, sigma: Any, off: Any) -> Any:
+    m, n = coupling.shape
+    system, right = own.copy(), np.empty((n, m + 1))
+    for i in range(n):
+        system[i, i] += 1.0 / sigma[i] ** 2
+        right[i, 0] = own_g[i] + off[i] / sigma[i] ** 2
+        right[i, 1:] = coupling[:, i]
+    solved = -np.linalg.solve(system, right)
+    step, follow = solved[:, 0].copy(), solved[:, 1:].copy()
+    reduced, slope = H.copy(), g.copy()
+    for i in range(m):
+        for k in range(n):
+            slope[i] += coupling[i, k] * step[k]
+            for j in range(m):
+                # Half of either order, so that it is symmetric.
+                reduced[i, j] += 0.5 * (coupling[i, k] * follow[k, j] + coupling[j, k] * follow[k, i])
+    return reduced, slope, step, follow
 
 
 def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatArray, FloatArray]:
@@ -169,31 +166,40 @@ def assemble(models: Iterable[Quadratic], first: int, last: int) -> tuple[FloatA
     return H, g
 
 
-def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24) -> FloatArray:
-    """−H⁻¹ g by banded Cholesky. Raises numpy.linalg.LinAlgError where H is not positive definite or not finite."""
+def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24, damping: float = 0.0) -> FloatArray:
+    """−H⁻¹ g by banded Cholesky, with the diagonal of H (n, n) larger by a part `damping`. Raises
+    numpy.linalg.LinAlgError where H is not positive definite or not finite."""
     size = len(g)
-    bandwidth = min(bandwidth, size)
     # Jacobi scaling: metres, radians and barely touched control points differ by many orders of magnitude.
     # A diagonal that rounding made zero or negative overflows.
     with np.errstate(over="ignore", invalid="ignore"):
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        scale = 1.0 / np.sqrt(np.maximum(H.ravel()[:: size + 1] * (1.0 + damping), 1e-300))
         scaled, right = H * scale[:, None] * scale, scale * g
+    scaled.ravel()[:: size + 1] *= 1.0 + damping
     if not (np.isfinite(scaled).all() and np.isfinite(right).all()):
         raise np.linalg.LinAlgError("the normal equations are not finite")
-    band = np.zeros((bandwidth, size))
-    for k in range(bandwidth):
-        band[k, : size - k] = np.diagonal(scaled, -k)
-    return -scale * np.asarray(scipy.linalg.solveh_banded(band, right, lower=True))
+    _, x, failed = scipy.linalg.lapack.dpbsv(
+        scaled.ravel()[_below_diagonal(size, min(bandwidth, size))], right, lower=1
+    )
+    if failed:
+        raise np.linalg.LinAlgError("the normal equations are not positive definite")
+    return np.asarray(-scale * x)
+
+
+@lru_cache(maxsize=64)
+def _below_diagonal(size: int, bandwidth: int) -> IntArray:
+    """Where a matrix (size, size) has its diagonal and those below (bandwidth, size), as LAPACK has them; the first
+    element where a diagonal has ended, which is not read."""
+    row, column = np.arange(bandwidth)[:, None] + np.arange(size), np.arange(size)
+    return np.where(row < size, row * size + column, 0)
 
 
 def solve_damped(H: FloatArray, g: FloatArray, bandwidth: int, damping: float = 0.0) -> FloatArray:
     """The step (n,) of Levenberg-Marquardt, damped more where rounding makes the system indefinite, as it does where a
     motion is hardly observed. Raises numpy.linalg.LinAlgError where no damping helps."""
     for _ in range(8):
-        damped = H.copy()
-        damped[np.diag_indices_from(H)] *= 1.0 + damping
         try:
-            step = solve(damped, g, bandwidth)
+            step = solve(H, g, bandwidth, damping)
         except np.linalg.LinAlgError:
             step = np.full_like(g, np.nan)
         if np.isfinite(step).all():

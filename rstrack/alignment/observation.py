@@ -49,6 +49,10 @@ class _Linearisation:
     brightness: FloatArray | None = None
 
 
+_Now = tuple[Spline, _Linearisation, FloatArray, Quadratic]
+"""A state's spline, a linearisation, what its control points have been moved by since, and its model there."""
+
+
 @dataclass
 class Observation:
     """An image against a reference. linearisation: the last one; putting an earlier one back takes a step back.
@@ -67,6 +71,7 @@ class Observation:
     linearisation: _Linearisation = _Linearisation()
     _visible: Any = None
     _slopes_at: SplineState | None = None
+    _last: _Now | None = None
 
     @property
     def is_depth(self) -> bool:
@@ -169,17 +174,18 @@ class Observation:
 
     def model(self, state: SplineState) -> Quadratic:
         """Quadratic model around the current state."""
-        return self.lin.model.moved(self._since(state)).scaled(self.stands_for)
+        return self._model(state).scaled(self.stands_for)
 
     def change(self, state: SplineState) -> float:
         """Change of the cost since the linearisation, by the quadratic model."""
-        model, moved = self.lin.model, self._since(state).ravel()
-        return self.stands_for * float(model.g @ moved + 0.5 * moved @ model.H @ moved)
+        # g δ + ½ δᵀ H δ, the moved model's slope being g + H δ.
+        slopes = self.lin.model.g + self._model(state).g
+        return self.stands_for * 0.5 * float(slopes @ self._since(state).ravel())
 
     def distance(self, state: SplineState) -> float:
         """How far the state is from that of the linearisation, squared, in σ of this image's own information."""
-        model, moved = self.lin.model, self._since(state).ravel()
-        return self.stands_for * float(moved @ model.H @ moved)
+        added = self._model(state).g - self.lin.model.g
+        return self.stands_for * float(added @ self._since(state).ravel())
 
     def slopes_at(self, state: SplineState) -> Spline:
         """Where the poses of its lines are differentiated: an earlier state as long as that is as good."""
@@ -190,8 +196,20 @@ class Observation:
 
     def _since(self, state: SplineState) -> FloatArray:
         """What the model's control points have been moved by since (k, 6)."""
-        model = self.lin.model
-        return state.received(model.first, model.last) - self.linearisation.at
+        return self._now(state)[2]
+
+    def _model(self, state: SplineState) -> Quadratic:
+        """That of the linearisation around the current state."""
+        return self._now(state)[3]
+
+    def _now(self, state: SplineState) -> _Now:
+        """The current state as this image has it: asked for several times before the state moves on."""
+        now = self._last
+        if now is None or now[0] is not state.spline or now[1] is not self.linearisation:
+            model = self.lin.model
+            since = state.received(model.first, model.last) - self.linearisation.at
+            self._last = now = state.spline, self.linearisation, since, model.moved(since)
+        return now
 
 
 def observe(frame: DeviceFrame, ref: Reference, options: Options, expected: FloatArray = SAME) -> list[Observation]:

@@ -167,7 +167,6 @@ def _linearise(terms: Terms, state: SplineState, problem: Problem, level: int, o
     ]
     settled = [o for o in problem.settled if level == 0 and _has_moved(o, state, problem.focal, tolerance)]
     anew = (*fresh, *settled)
-    terms.expect(state.spline, [o.image for o in anew], [(o.slopes_at(state), o.ref) for o in anew])
     for finish in [o.start(terms, state, level) for o in anew]:
         finish()
     return len(anew)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
+from rstrack.images.fast_se3 import compiled
 
 ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
 """Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s²,
@@ -75,11 +77,21 @@ def pose_constraint(spline: Spline, t: float, T_world_body: FloatArray, sigma: F
 def _summed(first: int, last: int, J: FloatArray, r: FloatArray, sigma: FloatArray) -> tuple[Quadratic, float]:
     """Model and cost of residuals r (n, 6) ~ N(0, diag sigma²), the i-th with derivative J[i] by control points from
     first + i on."""
-    weighted = np.swapaxes(J, 1, 2) / sigma[:, None, :] ** 2
-    blocks, slopes = weighted @ J, (weighted @ r[..., None])[..., 0]
-    H, g = np.zeros((6 * (last - first),) * 2), np.zeros(6 * (last - first))
-    for i in range(len(r)):
-        at = slice(6 * i, 6 * i + J.shape[2])
-        H[at, at] += blocks[i]
-        g[at] += slopes[i]
-    return Quadratic(first, H, g), 0.5 * float(np.sum((r / sigma) ** 2))
+    H, g, cost = _added(J, r, sigma, last - first)
+    return Quadratic(first, H, g), cost
+
+
+@compiled
+def _added(J: Any, r: Any, sigma: Any, points: Any) -> Any:
+    H, g, cost = np.zeros((6 * points, 6 * points)), np.zeros(6 * points), 0.0
+    count, _, columns = J.shape
+    for i in range(count):
+        for k in range(6):
+            information = 1.0 / sigma[i, k] ** 2
+            cost += 0.5 * r[i, k] ** 2 * information
+            for a in range(columns):
+                weighted = J[i, k, a] * information
+                g[6 * i + a] += weighted * r[i, k]
+                for b in range(columns):
+                    H[6 * i + a, 6 * i + b] += weighted * J[i, k, b]
+    return H, g, cost

@@ -9,6 +9,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
+from rstrack.images.fast_spline import changed, moved
 
 # Position u of the last line on its knot interval below which the last control point (weight u³/6) is mere guesswork.
 _OBSERVED = 0.6
@@ -109,7 +110,7 @@ class SplineState:
         for _ in range(missing):
             # Products drift away from rotations, and inverses by transposition amplify that (2.4 times a knot).
             new.append(se3.orthonormalise(new[-1] @ step))
-        self.spline = self.spline.changed(self.end, np.array(new[1:]))
+        self.spline = changed(self.spline, self.end, np.array(new[1:]))
         self.moved = np.concatenate([self.moved, np.zeros((missing, 6))])
 
     def smooth_end(self, t: float) -> None:
@@ -129,8 +130,7 @@ class SplineState:
     def apply(self, first: int, increments: FloatArray) -> None:
         """T_i ← exp(δ_i) T_i for control points number first, first + 1, ...; increments (n, 6)."""
         at = slice(first - self.first, first - self.first + len(increments))
-        points = se3.orthonormalise(se3.exp(increments) @ self.points[at])
-        self.spline = self.spline.changed(first, points)
+        self.spline = changed(self.spline, first, moved(self.points[at], increments))
         self.moved[at] += increments
 
 

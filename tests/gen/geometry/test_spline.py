@@ -229,22 +229,6 @@ def test_damaged_file_is_refused(tmp_path: Path, damage: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("first", [0, 1, 7, 11, 12])
-@pytest.mark.parametrize("count", [1, 3])
-def test_changed_control_points_derive_what_a_new_spline_would(first: int, count: int) -> None:
-    rng = np.random.default_rng(5)
-    spline = random_spline(rng, 12)
-    points = se3.exp(0.1 * rng.standard_normal((count, 6))) @ spline.control_points[[min(first, 11)]]
-    found = spline.changed(first, points)
-    expected = Spline(found.control_points, spline.t0, spline.dt)
-    assert len(found.control_points) == max(12, first + count)
-    np.testing.assert_array_equal(found.control_points[first : first + count], points)
-    np.testing.assert_array_equal(found.control_points[:first], spline.control_points[:first])
-    np.testing.assert_array_equal(found.control_points[first + count :], spline.control_points[first + count :])
-    np.testing.assert_allclose(found.increments, expected.increments, atol=1e-14)
-    np.testing.assert_allclose(found.left_gains, expected.left_gains, atol=1e-13)
-
-
 def test_the_end_of_a_spline_is_that_spline_there() -> None:
     whole = random_spline(np.random.default_rng(6), 20)
     end = whole.tail(9)
@@ -257,14 +241,5 @@ def test_the_end_of_a_spline_is_that_spline_there() -> None:
         for found, expected in zip(end.pose_jacobian(t, side), whole.pose_jacobian(t, side), strict=True):
             np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(end.locate(t)[0], whole.locate(t)[0])
-    points = se3.exp(0.1 * np.random.default_rng(7).standard_normal((6, 6))) @ whole.control_points[14]
-    for first in (12, 17):
-        changed, expected = end.changed(first, points), whole.changed(first, points)
-        assert changed.first == 9
-        np.testing.assert_array_equal(changed.control_points, expected.control_points[9:])
-        np.testing.assert_array_equal(changed.increments, expected.increments[9:])
-        np.testing.assert_array_equal(changed.left_gains, expected.left_gains[9:])
-    again = end.changed(12, points).tail(15)
-    np.testing.assert_array_equal(again.pose(again.t_end), whole.changed(12, points).pose(again.t_end))
     with pytest.raises(UserError, match="outside"):
         end.pose(end.t_begin - 0.01)

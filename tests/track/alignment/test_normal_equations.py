@@ -15,11 +15,10 @@ from rstrack.alignment.normal_equations import (
     Slopes,
     assemble,
     chain,
-    line_jacobian,
-    prepare_jacobians,
     solve,
     solve_damped,
 )
+from rstrack.images.fast_spline import jacobians
 
 TIMES = np.array([0.34, 0.352, 0.41, 0.43, 0.449, 0.452])  # segments 0 (twice), 2 (three times) and 3
 
@@ -45,22 +44,12 @@ def test_line_jacobian_is_the_derivative_of_the_twist_in_the_base_frame() -> Non
         return se3.log(se3.inverse(T_world_base) @ T @ se3.inverse(spline.pose(TIMES)) @ T_world_base)
 
     numeric = numeric_jacobian(twist, 6 * 9)
-    J = line_jacobian(spline, T_world_base, TIMES, 0, 7)
+    J = jacobians(spline, se3.inverse(T_world_base), TIMES, 0, 7)
     np.testing.assert_allclose(J, numeric[:, :, :42], atol=1e-7)
     assert np.abs(numeric[:, :, 42:]).max() == 0.0
     # Control points moved alike move every line alike.
     to_base = se3.adjoint(se3.inverse(T_world_base))
     np.testing.assert_allclose(J.reshape(6, 6, 7, 6).sum(axis=2), np.broadcast_to(to_base, (6, 6, 6)), atol=1e-12)
-
-
-def test_jacobians_worked_out_together_are_as_each_is_alone() -> None:
-    spline, other, T = random_spline(3), random_spline(3), se3.exp(np.full(6, 0.2))
-    images = [TIMES, TIMES[:4] + 1e-3, TIMES[1:2]]
-    prepare_jacobians(spline, images[:1])
-    prepare_jacobians(spline, [*images, TIMES[:4] + 1e-3])
-    for times in images:
-        together, alone = line_jacobian(spline, T, times, 0, 7), line_jacobian(other, T, times, 0, 7)
-        np.testing.assert_allclose(together, alone, rtol=0, atol=1e-14)
 
 
 def test_chain_equals_the_sum_over_blocks() -> None:
@@ -69,7 +58,7 @@ def test_chain_equals_the_sum_over_blocks() -> None:
     slopes = Slopes.of(spline, T, TIMES, None)
     model, coupling = chain(sums, slopes, own)
     assert (model.first, model.last) == (0, 7) and slopes.current.shape == (6, 6, 42)
-    J = line_jacobian(spline, T, TIMES, 0, 7)
+    J = jacobians(spline, se3.inverse(T), TIMES, 0, 7)
     np.testing.assert_array_equal(slopes.current, J)
     H = sum(J[i].T @ sums.H[i, 0] @ J[i] for i in range(6))
     g = sum(J[i].T @ sums.g[i, 0] for i in range(6))
@@ -91,7 +80,7 @@ def test_a_rolling_reference_moves_the_other_way() -> None:
     slopes = Slopes.of(spline, T, times, ref_times)
     model, _ = chain(sums, slopes)
     assert (model.first, model.last) == (0, 7)
-    J, K = line_jacobian(spline, T, times, 0, 7), line_jacobian(spline, T, ref_times, 0, 7)
+    J, K = jacobians(spline, se3.inverse(T), times, 0, 7), jacobians(spline, se3.inverse(T), ref_times, 0, 7)
     np.testing.assert_array_equal(slopes.current, J)
     H, g = np.zeros((42, 42)), np.zeros(42)
     for a in range(3):

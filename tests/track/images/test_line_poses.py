@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from rstrack_util import ENGINE, SCANS, T_COLOR_DEPTH, hand_held
@@ -13,12 +11,10 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.images import line_poses as lines
 from rstrack.images.line_poses import (
     Exposure,
     from_base_table,
     line_twists,
-    prepare,
     to_base_table,
 )
 
@@ -78,29 +74,6 @@ def test_poses_are_those_of_the_spline_at_each_line(scan: Scan, height: int) -> 
         before, after = spline.pose(image.times() - h), spline.pose(image.times() + h)
         difference = se3.log(se3.inverse(before) @ after) / (2.0 * h)
         np.testing.assert_allclose(twist, difference, atol=3e-4)
-
-
-def test_images_worked_out_together_are_as_each_is_alone() -> None:
-    spline, other = hand_held(3), hand_held(3)
-    images = [exposure(scan) for scan in SCANS] + [exposure(readout_s=0.0)]
-    images += [replace(images[0], stamp=STAMP + 0.013)]
-    prepare(spline, images[:2])
-    prepare(spline, [*images, images[0]])
-    for image in images:
-        for told in (line_poses, line_twists):
-            np.testing.assert_allclose(told(spline, image), told(other, image), rtol=0, atol=1e-14)
-    assert spline is not other and len(lines._motions.of(spline)) == len(images)
-
-
-def test_a_whole_recording_along_one_spline_is_not_remembered() -> None:
-    spline, image = hand_held(2), exposure()
-    first = line_poses(spline, image)
-    assert (image.lens, image.stamp) in lines._motions.of(spline)
-    for k in range(3 * lines.REMEMBERED):
-        line_poses(spline, replace(image, stamp=STAMP + 1e-4 * (k + 1)))
-    assert len(lines._motions.of(spline)) == lines.REMEMBERED
-    assert (image.lens, image.stamp) not in lines._motions.of(spline)
-    np.testing.assert_array_equal(line_poses(spline, image), first)
 
 
 def test_a_hand_that_jerks_costs_nanometres_where_a_constant_twist_costs_a_micrometre() -> None:
