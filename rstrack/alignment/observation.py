@@ -15,10 +15,12 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import SAME, best
 from rstrack.alignment.linearise import Linearised, Terms
-from rstrack.alignment.normal_equations import Quadratic
+from rstrack.alignment.normal_equations import Quadratic, block_diagonal
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH, START_INTENSITY
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.fast_se3 import compiled
+from rstrack.images.fast_spline import motion
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import THINNED, Reference
 from rstrack.options import Options
@@ -72,6 +74,7 @@ class Observation:
     _visible: Any = None
     _slopes_at: SplineState | None = None
     _last: _Now | None = None
+    _last_steady: tuple[_Now, float, tuple[FloatArray, FloatArray]] | None = None
 
     @property
     def is_depth(self) -> bool:
@@ -187,6 +190,25 @@ class Observation:
         added = self._model(state).g - self.lin.model.g
         return self.stands_for * float(added @ self._since(state).ravel())
 
+    def steady(self, state: SplineState) -> tuple[FloatArray, FloatArray]:
+        """H (12, 12) and g (12,) of two twists of the lines, in the world's axes about the camera at mid readout.
+
+        The first six move all lines, the others as much as a line is after mid readout: the last by all of it, the
+        first by its opposite (no line if all are exposed at once). All control points moved by one left increment move
+        every pose by it; by one that grows with their times (Greville), by one that grows with the pose's, to first
+        order.
+        """
+        now, last = self._now(state), self._last_steady
+        if last is None or last[0] is not now or last[1] != self.stands_for:
+            model, exposure = now[3], self.image.exposure
+            mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
+            at = state.spline.t0 + (np.arange(model.first, model.last) - 1) * state.dt
+            after = (at - mid) / half if half > 0.0 else np.zeros(len(at))
+            H, g = _steady(model.H, model.g, after, *motion(state.spline, mid)[0][:3, 3])
+            known = self.stands_for
+            self._last_steady = last = now, known, (known * H, known * g)
+        return last[2]
+
     def slopes_at(self, state: SplineState) -> Spline:
         """Where the poses of its lines are differentiated: an earlier state as long as that is as good."""
         before = self._slopes_at
@@ -261,7 +283,7 @@ def scores(fresh: Sequence[Observation], state: SplineState) -> Scores:
     cannot follow the motion within an image: the test has a twist of all lines and one that grows from the first line
     to the last.
     """
-    seen = [(o, *steady(o, state)) for o in fresh if o.is_linearised]
+    seen = [(o, *o.steady(state)) for o in fresh if o.is_linearised]
     kinds = [[s for s in seen if s[0].is_depth is is_depth] for is_depth in (True, False)]
     return Scores((_score(seen), _score(kinds[0]), _score(kinds[1])), _information(seen, state))
 
@@ -269,7 +291,7 @@ def scores(fresh: Sequence[Observation], state: SplineState) -> Scores:
 def _information(seen: Sequence[_Steady], state: SplineState) -> FloatArray:
     total = np.zeros((6, 6))
     for o, H, _ in seen:
-        turn = np.kron(np.eye(2), state.spline.pose(o.image.exposure.mid_time)[:3, :3])
+        turn = block_diagonal(motion(state.spline, o.image.exposure.mid_time)[0][:3, :3], 2)
         total += turn.T @ H[:6, :6] @ turn
     values, basis = np.linalg.eigh(total)
     # Of a motion that no pixel sees rounding may leave less than nothing, which would pass for knowledge when inverted.
@@ -284,19 +306,25 @@ def _score(seen: Sequence[_Steady]) -> float:
     return float(np.sqrt(max(0.0, float(g @ np.linalg.solve(H, g)))))
 
 
-def steady(o: Observation, state: SplineState) -> tuple[FloatArray, FloatArray]:
-    """H (12, 12) and g (12,) of two twists of an image's lines, in the world's axes about the camera at mid readout.
-
-    The first six move all lines, the others as much as a line is after mid readout: the last by all of it, the first by
-    its opposite (no line if all are exposed at once). All control points moved by one left increment move every pose by
-    it; by one that grows with their times (Greville), by one that grows with the pose's, to first order.
-    """
-    model, exposure = o.model(state), o.image.exposure
-    mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
-    at = state.spline.t0 + (np.arange(model.first, model.last) - 1) * state.dt
-    after = (at - mid) / half if half > 0.0 else np.zeros(len(at))
-    x, y, z = state.spline.pose(mid)[:3, 3]
+@compiled
+def _steady(H: Any, g: Any, after: Any, x: Any, y: Any, z: Any) -> Any:
+    """Of a model H (6k, 6k), g (6k,), whose control points follow mid readout by `after` (k,) half readouts; the camera
+    is then at x, y, z (m)."""
     about = np.eye(6)
-    about[:3, 3:] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
-    basis = np.kron(np.stack([np.ones(len(at)), after], axis=1), about)
-    return basis.T @ model.H @ basis, basis.T @ model.g
+    about[0, 4], about[0, 5], about[1, 3] = -z, y, z
+    about[1, 5], about[2, 3], about[2, 4] = -x, -y, x
+    both, slope = np.zeros((12, 12)), np.zeros(12)
+    for i in range(len(after)):
+        for p in range(6):
+            slope[p] += g[6 * i + p]
+            slope[6 + p] += after[i] * g[6 * i + p]
+            for j in range(len(after)):
+                for q in range(6):
+                    h = H[6 * i + p, 6 * j + q]
+                    both[p, q] += h
+                    both[6 + p, q] += after[i] * h
+                    both[p, 6 + q] += after[j] * h
+                    both[6 + p, 6 + q] += after[i] * after[j] * h
+    turn = np.zeros((12, 12))
+    turn[:6, :6], turn[6:, 6:] = about, about
+    return turn.T @ both @ turn, turn.T @ slope

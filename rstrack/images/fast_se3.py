@@ -18,13 +18,21 @@ EXP, _INVERSE, _CORNER = (np.ascontiguousarray(s.T) for s in (so3.EXP_SERIES, so
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _NEWTON_STEPS = 3  # towards the nearest rotation: quadratic, from a product of two that has drifted by rounding
 
-compiled = numba.njit(cache=True)
+
+def compiled(function: Any) -> Any:
+    """A function compiled by Numba, and stored on the disk where there is a folder to write to."""
+    try:
+        return numba.njit(cache=True)(function)
+    except RuntimeError:  # no such folder
+        return numba.njit(function)
+
 
 # -- vectors and matrices ---------------------------------------------------------------------------------------------
 
 
 @compiled
 def series(coefficients: Any, x: Any) -> Any:
+    """Σ coefficients[k] xᵏ."""
     total = 0.0
     for k in range(len(coefficients) - 1, -1, -1):
         total = total * x + coefficients[k]
@@ -33,6 +41,7 @@ def series(coefficients: Any, x: Any) -> Any:
 
 @compiled
 def plus(a: Any, b: Any, factor: Any) -> Any:
+    """a + factor b."""
     return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
 
 
@@ -48,11 +57,13 @@ def added(A: Any, B: Any, factor: Any) -> Any:
 
 @compiled
 def cross(a: Any, b: Any) -> Any:
+    """a × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
 def turned(A: Any, v: Any) -> Any:
+    """A v."""
     return (
         A[0] * v[0] + A[1] * v[1] + A[2] * v[2],
         A[3] * v[0] + A[4] * v[1] + A[5] * v[2],
@@ -62,17 +73,20 @@ def turned(A: Any, v: Any) -> Any:
 
 @compiled
 def product(A: Any, B: Any) -> Any:
+    """A B."""
     x, y, z = turned(A, (B[0], B[3], B[6])), turned(A, (B[1], B[4], B[7])), turned(A, (B[2], B[5], B[8]))
     return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
 
 
 @compiled
 def transposed(A: Any) -> Any:
+    """Aᵀ."""
     return A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]
 
 
 @compiled
 def hat(v: Any) -> Any:
+    """The matrix of v ×."""
     return 0.0, -v[2], v[1], v[2], 0.0, -v[0], -v[1], v[0], 0.0
 
 
@@ -85,6 +99,7 @@ def matrix(T: Any) -> Any:
 
 @compiled
 def store(R: Any, t: Any, out: Any) -> None:
+    """Rotation and translation into the upper rows of a pose."""
     for i in range(3):
         for j in range(3):
             out[i, j] = R[3 * i + j]
@@ -103,6 +118,7 @@ def polynomial(phi: Any, first: Any, second: Any) -> Any:
 
 @compiled
 def exp(rho: Any, phi: Any) -> Any:
+    """Rotation and translation of a twist [rho; phi], see `se3.exp`."""
     theta2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     if theta2 <= 1.0:
         a, b, c = series(EXP[0], theta2), series(EXP[1], theta2), series(EXP[2], theta2)

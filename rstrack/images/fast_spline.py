@@ -50,7 +50,7 @@ def _segment(t: Any, t0: Any, dt: Any, first: Any, last: Any) -> Any:
 
 
 @compiled
-def _motion(points: Any, increments: Any, at: Any, u: Any, dt: Any) -> Any:
+def _motion_at(points: Any, increments: Any, at: Any, u: Any, dt: Any) -> Any:
     """Pose R, t and body velocity v, ω in the middle of the control points number at..at+3 held."""
     R, t = matrix(points[at])
     v, w = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -69,7 +69,7 @@ def _motions(points: Any, increments: Any, first: Any, t0: Any, dt: Any, times: 
     last = first + len(points) - 4
     for n in range(len(times)):
         number, u = _segment(times[n], t0, dt, first, last)
-        R, t, v, w = _motion(points, increments, number - first, u, dt)
+        R, t, v, w = _motion_at(points, increments, number - first, u, dt)
         store(R, t, T[n])
         T[n, 3, 3] = 1.0
         for i in range(3):
@@ -246,6 +246,18 @@ def motions(spline: Spline, times: FloatArray) -> tuple[FloatArray, FloatArray]:
     """`Spline.pose_and_velocity` at times (n,), s: T_world_body (n, 4, 4), body twists (n, 6). UserError outside."""
     _check(spline, times)
     return _motions(spline.control_points, spline.increments, spline.first, spline.t0, spline.dt, times)
+
+
+def motion(spline: Spline, t: float) -> tuple[FloatArray, FloatArray]:
+    """`motions` at one time: T_world_body (4, 4), body twist (6,)."""
+    T, twist = motions(spline, np.array([t]))
+    return T[0], twist[0]
+
+
+def twist_between(T_world_a: FloatArray, T_world_b: FloatArray) -> FloatArray:
+    """log(T_world_a⁻¹ T_world_b), (6,), of poses (4, 4) less than half a turn apart."""
+    increments, _ = _derived(np.stack([T_world_a, T_world_b]))
+    return np.asarray(increments[0])
 
 
 def jacobians(spline: Spline, T_base_world: FloatArray, times: FloatArray, first: int, count: int) -> FloatArray:

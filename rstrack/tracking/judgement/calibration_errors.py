@@ -18,7 +18,8 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.alignment.observation import Observation, steady
+from rstrack.alignment.normal_equations import block_diagonal
+from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import CALIBRATION_NAMES
 from rstrack.tracking.judgement.consider import CLOCK, COUNT, Calibration
@@ -68,10 +69,10 @@ class Common:
         see `Scores`.
         """
         total = _nothing()
-        turn = np.kron(np.eye(2), at[:3, :3])
+        turn = block_diagonal(at[:3, :3], 2)
         for o in fresh:
             if o.is_linearised:
-                H, _ = steady(o, state)
+                H, _ = o.steady(state)
                 moved = self.moved(calibration, o, state) + self.of_keyframe(o.ref.index, at)
                 total += turn.T @ H[:6, :6] @ turn @ moved
         return total / excess**2

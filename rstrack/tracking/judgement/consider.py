@@ -20,6 +20,7 @@ from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.rig import CALIBRATION_NAMES, Rig
+from rstrack.images.fast_spline import motion
 from rstrack.images.sampling import NEAREST
 from rstrack.keyframes.keyframe import Points, Reference, strides
 
@@ -155,6 +156,7 @@ class Calibration:
         self._landmarks: dict[int, Landmarks] = {}
         # Of the newest frame's images: what they are like changes little while it is aligned.
         self._couplings: dict[tuple[int, int, float, bool], Coupling] = {}
+        self._known: dict[tuple[int, int, float, bool, int], FloatArray] = {}
 
     @classmethod
     def of(cls, rig: Rig, depth: Lens, color: Lens) -> Calibration:
@@ -174,7 +176,7 @@ class Calibration:
     def moved(self, o: Observation, state: SplineState, velocity: FloatArray, count: int = 6) -> FloatArray:
         """How one σ of each parameter would have an image move its lines (count, 21), against a rectified keyframe.
 
-        velocity (6,): at which that was taken. count: 6 for all lines alike, 12 as of `score.steady`.
+        velocity (6,): at which that was taken. count: 6 for all lines alike, 12 as of `Observation.steady`.
         """
         return self._twists(o, state, velocity, count)[:, :COUNT] * self.sigmas
 
@@ -187,10 +189,13 @@ class Calibration:
         if key not in self._couplings:
             if any(frame != o.frame for frame, *_ in self._couplings):
                 self._couplings.clear()
-            T_world_cam, own = state.spline.pose_and_velocity(o.image.exposure.mid_time)
+                self._known.clear()
+            T_world_cam, own = motion(state.spline, o.image.exposure.mid_time)
             T_cam_ref = se3.inverse(T_world_cam) @ o.ref.T_world_base
             self._couplings[key] = coupling(o, self._seen(o.ref, velocity), self._rays, T_cam_ref, own)
-        return self._couplings[key].twists(count, o.ref.median_depth)
+        if (*key, count) not in self._known:
+            self._known[*key, count] = self._couplings[key].twists(count, o.ref.median_depth)
+        return self._known[*key, count]
 
     def _seen(self, ref: Reference, velocity: FloatArray) -> Landmarks:
         found = self._landmarks.get(ref.index)

@@ -23,8 +23,10 @@ from scipy.special import chdtri
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.observation import Observation, steady
+from rstrack.alignment.normal_equations import block_diagonal
+from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
+from rstrack.images.fast_spline import motion, motions, twist_between
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors, Considered
 from rstrack.tracking.judgement.uncertainty import SYSTEMATIC_PX, Systematic, Uncertainty, of_pixels
 
@@ -54,14 +56,15 @@ class Prediction:
         spline is extrapolated to from those means little.
         """
         if earlier is None:
-            T_world_depth, velocity = extrapolated.pose_and_velocity(t)
-            return cls(t, T_world_depth, velocity, covariance)
-        before, last = extrapolated.pose(np.array(earlier))
-        velocity = se3.log(se3.inverse(before) @ last) / (earlier[1] - earlier[0])
+            return cls(t, *motion(extrapolated, t), covariance)
+        before, last = motions(extrapolated, np.array(earlier))[0]
+        velocity = twist_between(before, last) / (earlier[1] - earlier[0])
         return cls(t, last @ se3.exp((t - earlier[1]) * velocity), velocity, covariance)
 
     def pose(self, t: float) -> FloatArray:
         """T_world_depth (4, 4) at a time (s)."""
+        if t == self.t:
+            return self.T_world_depth
         return np.asarray(self.T_world_depth @ se3.exp((t - self.t) * self.velocity))
 
 
@@ -165,7 +168,7 @@ def disagreement(
     first = max(aligned, key=lambda o: o.is_depth)
     exposure, distance = first.image.exposure, first.ref.median_depth
     mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
-    here = Prediction(mid, *state.spline.pose_and_velocity(mid), Uncertainty().state)
+    here = Prediction(mid, *motion(state.spline, mid), Uncertainty().state)
     seen = [_measured(o, state, here, considered) for o in aligned]
 
     def squared(z: FloatArray) -> FloatArray:
@@ -247,11 +250,11 @@ def _measured(
 ) -> _Measured:  # fmt: skip
     exposure = o.image.exposure
     mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
-    H, g = steady(o, state)
-    pose, velocity = state.spline.pose_and_velocity(mid)
-    to_camera = np.kron(np.eye(4), pose[:3, :3].T)
+    H, g = o.steady(state)
+    pose, velocity = motion(state.spline, mid)
+    to_camera = block_diagonal(pose[:3, :3].T, 4)
     H, g = to_camera @ H @ to_camera.T, to_camera @ g
-    # `steady` has the change over half a readout where the state has the velocity.
+    # `Observation.steady` has the change over half a readout where the state has the velocity.
     by = np.concatenate([np.ones(6), np.full(6, max(half, 1e-3))])
     # Scaled by what is open, since gain and offset, taken out of H, may leave rounding below zero.
     spread, basis = np.linalg.eigh(H * np.outer(_OPEN, _OPEN))
@@ -263,8 +266,8 @@ def _measured(
         moved -= R @ H @ considered.lag(o, state) / by
         D[:6] += considered.of_keyframe(o, pose)
         D -= considered.predicted(pose)
-    R += np.kron(np.eye(2), of_pixels(SYSTEMATIC_PX, o.ref.lens.camera.fx, o.ref.median_depth))
+    R += block_diagonal(of_pixels(SYSTEMATIC_PX, o.ref.lens.camera.fx, o.ref.median_depth), 2)
     R = R / np.outer(by, by)
-    off = se3.log(se3.inverse(predicted.pose(mid)) @ pose)
+    off = twist_between(predicted.pose(mid), pose)
     deviation = np.concatenate([off, velocity - predicted.velocity])
     return _Measured(o, deviation, deviation + moved, 0.5 * (R + R.T), D)

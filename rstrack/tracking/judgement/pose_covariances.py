@@ -13,6 +13,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Observation, Scores
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.fast_spline import motion
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.judgement.calibration_errors import Common, Considered
@@ -68,7 +69,7 @@ class PoseCovariances:
         """`common` so many seconds later (0: found anew), of a frame then so uncertain; score: by its images."""
         if self.calibration.is_exact or not fresh:
             return self.common
-        at = state.spline.pose(fresh[0].image.exposure.mid_time)
+        at = motion(state.spline, fresh[0].image.exposure.mid_time)[0]
         own = self.common.cross_information(self.calibration, fresh, state, at, score.excess)
         before = self.common if seconds else self.common.at_rest()
         return before.after(seconds, at, uncertainty.state, score.information, own)
@@ -76,14 +77,14 @@ class PoseCovariances:
     def add(self, frame: DeviceFrame, ref: Reference, spline: Spline, oldest: int = 0) -> None:
         """A frame that has been found against a keyframe; what is before frame `oldest` is forgotten."""
         kept = {k: one for k, one in self._recent.items() if k >= oldest}
-        _, velocity = spline.pose_and_velocity(frame.depth.exposure.mid_time)
+        _, velocity = motion(spline, frame.depth.exposure.mid_time)
         covariance = self.uncertainty.covariance(self.focal_px, ref.median_depth)
         own = _Recent(ref.index, covariance, self.common.pose, velocity, frame.color_late_s)
         self._recent = kept | {frame.index: own}
 
     def look_at(self, ref: Reference, spline: Spline) -> None:
         """The first keyframe, before anything is found at it."""
-        self._keep(ref.index, np.zeros_like(self.common.pose), spline.pose_and_velocity(ref.t)[1])
+        self._keep(ref.index, np.zeros_like(self.common.pose), motion(spline, ref.t)[1])
 
     def begin(self, ref: Reference, frames: Sequence[DeviceFrame], spline: Spline) -> None:
         """The first keyframe, made of one of the first frames; the world is the first of them."""
@@ -118,13 +119,13 @@ class PoseCovariances:
 
     def of(self, report: FrameReport, frame: DeviceFrame, spline: Spline, at: int = -1) -> FrameReport:
         """The same where it has none, too: that it is then as good as keyframe `at`."""
-        T_world_depth, own = spline.pose(frame.stamp), self._recent.get(frame.index)
+        T_world_depth, own = motion(spline, frame.stamp)[0], self._recent.get(frame.index)
         from_world = se3.adjoint(se3.inverse(T_world_depth))
         if own is None:
             common = self.common.of_keyframe(at, T_world_depth)
             covariance = np.zeros((6, 6))
         else:
-            to_stamp = from_world @ se3.adjoint(spline.pose(frame.depth.exposure.mid_time))
+            to_stamp = from_world @ se3.adjoint(motion(spline, frame.depth.exposure.mid_time)[0])
             at, covariance = own.ref, to_stamp @ own.covariance @ to_stamp.T
             common = from_world @ own.common
         may_be_wrong = self.calibration.sigmas > 0.0

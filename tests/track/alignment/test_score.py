@@ -11,7 +11,6 @@ from pose_terms import PoseTerms, sighting
 from rstrack_util import hand_held
 
 from rsgen.geometry import se3
-from rstrack.alignment import observation as score
 from rstrack.alignment.observation import Observation, Scores, scores
 from rstrack.alignment.spline_state import SplineState
 
@@ -75,7 +74,7 @@ def test_they_are_those_of_the_state_not_of_the_linearisation() -> None:
 def test_what_rounding_leaves_of_an_unseen_motion_is_no_information(monkeypatch: pytest.MonkeyPatch) -> None:
     """Regression: inverted, an information below zero is a small covariance, and a pose that slid was known."""
     H = np.diag([4.0, 3.0, -1e-3, 5.0, 6.0, 7.0, *np.ones(6)])
-    monkeypatch.setattr(score, "steady", lambda *_: (H, np.zeros(12)))
+    monkeypatch.setattr(Observation, "steady", lambda *_: (H, np.zeros(12)))
     R = SplineState(TRUTH).spline.pose(MID)[:3, :3]
     turn = np.kron(np.eye(2), R)
     want = turn.T @ np.diag([4.0, 3.0, 0.0, 5.0, 6.0, 7.0]) @ turn

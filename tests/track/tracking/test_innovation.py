@@ -12,7 +12,6 @@ from scipy.stats import chi2
 
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.tracking.judgement import innovation as module
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
 from rstrack.tracking.judgement.innovation import Prediction, disagreement, learnt, mixture, weighed
 from rstrack.tracking.judgement.uncertainty import Systematic
@@ -29,7 +28,7 @@ def spread(metres: float, radians: float, rng: np.random.Generator) -> np.ndarra
 
 
 def image(is_depth: bool, R: np.ndarray, off: np.ndarray) -> Any:
-    """An image that has its own minimum at `off` (12,), with covariance R, in `steady`'s unknowns."""
+    """An image that has its own minimum at `off` (12,), with covariance R, in `Observation.steady`'s unknowns."""
     H = np.linalg.inv(R)
     exposure = SimpleNamespace(mid_time=0.1, first_time=0.1 - HALF, last_time=0.1 + HALF)
     o = SimpleNamespace(
@@ -40,13 +39,8 @@ def image(is_depth: bool, R: np.ndarray, off: np.ndarray) -> Any:
     def count_as(independent: float) -> None:
         o.H, o.g, o.independent = (part * independent / o.independent for part in (o.H, o.g, o.independent))
 
-    o.count_as = count_as
+    o.count_as, o.steady = count_as, lambda _: (o.H, o.g)
     return o
-
-
-@pytest.fixture(autouse=True)
-def _steady(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "steady", lambda o, _: (o.H, o.g))
 
 
 def at_rest() -> tuple[Any, Spline]:
@@ -54,7 +48,7 @@ def at_rest() -> tuple[Any, Spline]:
     return SimpleNamespace(spline=spline), spline
 
 
-# The state has the velocity where `steady` has what it changes over half a readout.
+# The state has the velocity where `Observation.steady` has what it changes over half a readout.
 BY = np.concatenate([np.ones(6), np.full(6, HALF)])
 
 
@@ -158,7 +152,7 @@ def test_what_all_images_and_the_prediction_have_in_common_explains_nothing() ->
 
 
 def sigmas(images: list[Any], P: np.ndarray) -> np.ndarray:
-    """σ (12,) of `mixture` where the camera was found as predicted; in `steady`'s unknowns."""
+    """σ (12,) of `mixture` where the camera was found as predicted; in `Observation.steady`'s unknowns."""
     state, prediction = at_rest()[0], predicted(P)
     return np.asarray(np.sqrt(np.diag(mixture(weighed(images, state, prediction), images, state, prediction))) * BY)
 
