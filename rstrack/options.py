@@ -101,6 +101,12 @@ class Options:
         "recording has ended, online whenever a keyframe is complete (default: end with 'rstrack track', off in "
         "benchmarks and live)",
     ] = None
+    budget_ms: Annotated[
+        float | None,
+        "time for a frame, ms: alignment ends before it is done, and keyframes wait for the next frame, where there is "
+        "no time left; such poses have a larger covariance (default: as long as it takes; with a budget results depend "
+        "on how fast the machine is)",
+    ] = None
     memory_gb: Annotated[
         float,
         "images of old keyframes that take more than this go to temporary files (in TMPDIR) until needed, and so do "
@@ -123,6 +129,8 @@ class Options:
         for name in ("keyframe_distance", "keyframe_angle_deg", "max_depth", "memory_gb"):
             if not getattr(self, name) > 0.0:
                 raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
+        if self.budget_ms is not None and not self.budget_ms > 0.0:
+            raise UserError(f"budget_ms = {self.budget_ms!r} must be positive, or not given")
         if not 0.0 <= self.blur_sigma_px < 1e3:
             raise UserError(f"blur_sigma_px = {self.blur_sigma_px!r} must be 0 (off) or positive, in pixels")
         if self.bootstrap_frames < 3:

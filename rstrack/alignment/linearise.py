@@ -21,6 +21,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
 from rstrack.alignment.brightness import SAME, SIGMA, contrast
 from rstrack.alignment.normal_equations import Eliminated, Quadratic, Slopes, chain, eliminate
+from rstrack.alignment.pace import Pace
 from rstrack.alignment.residuals import (
     WHOLE,
     GeometricInput,
@@ -141,6 +142,7 @@ class Terms:
     # Whether what large pixels bend counts, by little: smooth ones alone would let the camera slide. Colour holds it.
     counts_rough: bool = True
     timer: Timer = untimed
+    pace: Pace = field(default_factory=Pace)
     _kernel: Kernels = field(init=False)
 
     def __post_init__(self) -> None:
@@ -151,7 +153,7 @@ class Terms:
         """The terms of a rig as a method has them."""
         return cls(
             device.e, device.device_rays, depth_image=device.sigma.depth_image, blur_sigma_px=options.blur_sigma_px,
-            counts_rough=not options.photometric, timer=device.timer,
+            counts_rough=not options.photometric, timer=device.timer, pace=Pace(options.budget_ms),
         )  # fmt: skip
 
     def geometric(

@@ -7,7 +7,7 @@ fraction of a pixel the model is only shifted (g += H ε); it is linearised anew
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -40,7 +40,8 @@ MOST_STEPS = (15, 8, 30)
 class Solved:
     """What an optimisation did: linearisations, steps, refused steps, and the last step's movement of a line in px.
 
-    is_within_noise: that step was shorter than what noise leaves open.
+    is_within_noise: that step was shorter than what noise leaves open. is_cut: there was no time for more, see `Pace`;
+    first, step (n, 6): the last step, of the control points from number `first` on.
     """
 
     evaluations: int = 0
@@ -48,6 +49,9 @@ class Solved:
     refused: int = 0
     last_shift: float = np.inf
     is_within_noise: bool = False
+    is_cut: bool = False
+    first: int = 0
+    step: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
 
 
 @dataclass(frozen=True)
@@ -103,38 +107,44 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
     acceleration, is_plain = AndersonMixing(), True
     before = [o.linearisation for o in every]
     once_more = problem.predicted and level == 0
+    done.is_cut = False
     for n in range(most):
-        done.evaluations += _linearise(terms, state, problem, level, once_more and n == 1)
-        priors = [prior(state.spline) for prior in problem.priors]
-        now = _cost(state, problem, weights) + sum(c for _, c in priors)
-        if step is not None and now > cost + _WORSE * sum(weights.values()):
-            # Worse than before: back to where it was, and a shorter step from there.
-            state.apply(first, -step)
-            for observation, earlier in zip(every, before, strict=True):
-                observation.linearisation = earlier
-            priors = [prior(state.spline) for prior in problem.priors]
-            damping = max(1e-3, 10.0 * damping) if is_plain else damping
-            acceleration.reset()
-            done.refused += 1
-        else:
-            damping, cost = 0.1 * damping if damping > 1e-4 else 0.0, now
-        before = [o.linearisation for o in every]
-        models = [o.model(state) for o in every] + [prior for prior, _ in priors]
-        with terms.timer("linear algebra: assemble"):
-            H, g = assemble(models, *problem.free)
-        with terms.timer("linear algebra: solve"):
-            plain = _damped_step(H, g, damping, problem)
-            at = state.received(first, first + len(plain)).ravel()
-            step = acceleration.extrapolated(at, plain.ravel(), H).reshape(-1, 6)
-            is_plain = bool((step == plain).all())
-        state.apply(first, step)
-        done.iterations += 1
-        done.last_shift = max(_shift(problem, first, step), _shift(problem, first, plain))
-        done.is_within_noise = -float(g @ plain.ravel()) < _LAST[level] and all(_is_noisy(o) for o in problem.fresh)
-        if once_more and n == 0:
-            continue
-        if done.is_within_noise or done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
+        if n and not terms.pace.allows_step(level):
+            done.is_cut = True
             break
+        with terms.pace.step(level):
+            done.evaluations += _linearise(terms, state, problem, level, once_more and n == 1)
+            priors = [prior(state.spline) for prior in problem.priors]
+            now = _cost(state, problem, weights) + sum(c for _, c in priors)
+            if step is not None and now > cost + _WORSE * sum(weights.values()):
+                # Worse than before: back to where it was, and a shorter step from there.
+                state.apply(first, -step)
+                for observation, earlier in zip(every, before, strict=True):
+                    observation.linearisation = earlier
+                priors = [prior(state.spline) for prior in problem.priors]
+                damping = max(1e-3, 10.0 * damping) if is_plain else damping
+                acceleration.reset()
+                done.refused += 1
+            else:
+                damping, cost = 0.1 * damping if damping > 1e-4 else 0.0, now
+            before = [o.linearisation for o in every]
+            models = [o.model(state) for o in every] + [prior for prior, _ in priors]
+            with terms.timer("linear algebra: assemble"):
+                H, g = assemble(models, *problem.free)
+            with terms.timer("linear algebra: solve"):
+                plain = _damped_step(H, g, damping, problem)
+                at = state.received(first, first + len(plain)).ravel()
+                step = acceleration.extrapolated(at, plain.ravel(), H).reshape(-1, 6)
+                is_plain = bool((step == plain).all())
+            state.apply(first, step)
+            done.iterations += 1
+            done.first, done.step = first, plain
+            done.last_shift = max(_shift(problem, first, step), _shift(problem, first, plain))
+            done.is_within_noise = -float(g @ plain.ravel()) < _LAST[level] and all(_is_noisy(o) for o in problem.fresh)
+            if once_more and n == 0:
+                continue
+            if done.is_within_noise or done.last_shift < (_tolerance(problem) if level == 0 else STOP_PX[level]):
+                break
 
 
 def _shift(problem: Problem, first: int, step: FloatArray) -> float:

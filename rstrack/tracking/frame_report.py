@@ -45,6 +45,7 @@ class FrameReport:
     are none: of lost frames, and with the baseline. held_by_motion: largest part (0..1) that the motion before, not the
     images, has in what is known of any direction. moving: part of the depth image that was left out since it moves by
     itself.
+    is_cut: its time was over before its alignment had ended, see `Pace`.
     bridged: its images were of no use, as fault says, and it has its pose from an IMU and from frames after it: until
     these came, it was lost. segment: number, from 1, of the `segments.Segment` that has the frame; 0: the first track.
     """
@@ -67,6 +68,7 @@ class FrameReport:
     held_by_motion: float = float("nan")
     moving: float = 0.0
     fault: Fault = Fault.NONE
+    is_cut: bool = False
     bridged: bool = False
     segment: int = 0
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from rsgen.array_types import FloatArray
+from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation, Scores, scores
 from rstrack.alignment.optimizer import Solved
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.fast_spline import jacobians, motion
 from rstrack.images.pyramid import DepthImage
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import Fault
@@ -97,6 +102,9 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
         if weighs:
             more = mixture(innovation, on_reference, window.state, predicted, considered)
             uncertainty = replace(uncertainty, mixture=more)
+        if found.solved.is_cut:
+            off = unfinished(found.solved, window.state, mid)
+            uncertainty = replace(uncertainty, mixture=uncertainty.mixture + np.outer(off, off))
         if weighs and not young:
             known = learnt(innovation, uncertainty.systematic, uncertainty.calibration, score.excess)
             uncertainty = replace(uncertainty, systematic=known[0], calibration=known[1])
@@ -109,6 +117,20 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
         if implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.MOTION
     return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
+
+
+def unfinished(solved: Solved, state: SplineState, t: float) -> FloatArray:
+    """What may be left of an alignment that was cut, as pose and velocity (12,) at time t (s) in the camera's axes.
+
+    As much as the last step: Gauss-Newton's steps shrink by half or more.
+    """
+    T_camera_world = se3.inverse(motion(state.spline, t)[0])
+    first, last = state.segment(t), solved.first + len(solved.step)
+    begin, count = min(first, solved.first), max(first + 4, last) - min(first, solved.first)
+    steps = np.zeros((count, 6))
+    steps[solved.first - begin : last - begin] = solved.step
+    off = jacobians(state.spline, T_camera_world, np.array([t]), begin, count)[0] @ steps.ravel()
+    return np.concatenate([off, np.zeros(6)])
 
 
 def judge_unpredicted(track: TrackState, found: Match) -> Verdict:

@@ -40,7 +40,9 @@ _LED_S = 0.5
 _YOUNG = 4
 
 # What of a tracker frames change, beside its track.
-_STATE = "relocaliser", "bridge", "last_fed"
+_STATE = "relocaliser", "bridge", "last_fed", "postponed"
+# Of a frame's work, for its `Pace`.
+_KEYFRAME = "keyframe"
 
 
 class Tracker:
@@ -61,6 +63,7 @@ class Tracker:
         self._relocaliser = Relocaliser()
         self._bridge = Bridge()
         self._last_fed: float | None = None
+        self._postponed = False
 
     # -- frame by frame ---------------------------------------------------------------------------------------------
 
@@ -73,21 +76,23 @@ class Tracker:
                 f"tracker: frame stamped {stamp:.6f} s follows one stamped {self._last_fed} s: frames must come in "
                 f"order of time and less than {_BREAK_S:.0f} s apart; cut the recording there"
             )
+        track.terms.pace.begin()
         new = track.upload(len(track.reports), frame)
         self._last_fed = stamp
         if len(track.found.stamps) == 1 and track.succession.recent:
             fit_knots(track, gap)
-        if track.window is None:
-            report = start(track, new)
-        elif not track.keyframes:
-            report = bootstrap(track, new)
+        if track.window is None or not track.keyframes:
+            track.terms.pace.lift()
+            report = start(track, new) if track.window is None else bootstrap(track, new)
         elif self._bridge.leads(track, new):
             report = self._follow(new, stamp - track.found.stamps[-1], led=True)
         elif stamp - track.found.stamps[-1] > _GAP_S:
+            track.terms.pace.lift()
             report = self._relocalise(new)
         else:
             report = self._follow(new, gap)
         track.reports.append(report)
+        track.terms.pace.end()
         return report
 
     def _follow(self, new: DeviceFrame, gap: float, led: bool = False) -> FrameReport:
@@ -114,13 +119,23 @@ class Tracker:
         track.placed(new, found.fresh)
         overlap = track.succession.view(new, found.ref, found.on_reference, found.left.gone)
         frozen = track.succession.fuse_frozen(found.window)
-        renewed = track.succession.renew(found.window, new, frozen, overlap)
+        renewed = self._renew(found.window, new, frozen, overlap)
         track.found.release(found.window, min(min(f.first_time, f.stamp) for f in track.succession.recent))
         return track.report(new, found.on_reference, found.solved, keyframe=renewed, overlap=overlap)
+
+    def _renew(self, window: Window, new: DeviceFrame, frozen: DeviceFrame | None, overlap: float) -> bool:
+        """Renew the keyframe if need be; at the next frame where there is no time left, but not twice."""
+        track, pace = self.track, self.track.terms.pace
+        self._postponed = not self._postponed and not pace.allows(_KEYFRAME)
+        if self._postponed:
+            return False
+        with pace.part(_KEYFRAME):
+            return track.succession.renew(window, new, frozen, overlap)
 
     def _search(self, found: Match, fault: Fault, gap: float, led: bool) -> FrameReport:
         """A frame is not where the motion led: look for it elsewhere."""
         track, new = self.track, found.frame
+        track.terms.pace.lift()
         if not led:
             return self._relocalise(new, fault)
         # Where the camera has turned away from the keyframe meanwhile another one may show what it sees.

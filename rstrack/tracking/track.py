@@ -66,7 +66,13 @@ class Match:
         return [o for o in self.fresh if o.ref.index == self.ref.index]
 
     def again(self) -> None:
-        """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro."""
+        """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro.
+
+        Not where there is no time left.
+        """
+        if not self.window.has_time:
+            self.solved.is_cut = True
+            return
         self.solved = self.window.solve(
             self.fresh, (0,), gauge_of(self.window, self.frame, self.ref), is_rolling(self.ref)
         )
@@ -274,5 +280,5 @@ class TrackState:
     ) -> FrameReport:  # fmt: skip
         """What became of a frame."""
         report = frame_report(new.stamp, fresh, solved, keyframe=keyframe, fault=fault, overlap=overlap)
-        report = replace(report, moving=new.depth.moving)
+        report = replace(report, moving=new.depth.moving, is_cut=solved is not None and solved.is_cut)
         return report if fault else self.covariances.report(report, new, fresh, self.known()[0].spline)

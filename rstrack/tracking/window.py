@@ -77,6 +77,11 @@ class Window:
         """T_world_depth(t) as it is now."""
         return self.state.spline
 
+    @property
+    def has_time(self) -> bool:
+        """Whether there is time for a step at full size."""
+        return self._terms.pace.allows_step(0)
+
     def copy(self) -> Window:
         """A window that can be changed without changing this one."""
         twin = Window(self._terms, self._focal, self.state.copy(), self.segment_start, self._inertia)

@@ -71,6 +71,7 @@ def run_info(run: Run, closing: Closing | None, times: dict[str, float]) -> dict
         "checkpoint_error": (run.checkpoint.problem if run.checkpoint is not None else "") or None,
         "unreadable": [{"frame": k, "error": problem} for k, problem in done.unreadable],
         "lost": sum(report.lost for report in reports),
+        "cut": sum(report.is_cut for report in reports),
         "segments": run.segments.info(),
         "loops": None if closing is None else closing.info(),
         "spline_valid": tracker.spline_valid,
@@ -95,7 +96,7 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
     notes: dict[str, Any] = {"notes": assumed} if assumed else {}
     if read is not None and dataset.imu_files is not None and dataset.imu_files.given is not None:
         notes["imu_file"] = str(dataset.imu_files.given.resolve())
-    versions = {name: version(name) for name in ("numpy", "scipy", "drjit")}
+    versions = {name: version(name) for name in ("numpy", "scipy", "numba", "drjit")}
     return {
         "method": options.method,
         "options": dataclasses.asdict(options),
