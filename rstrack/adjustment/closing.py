@@ -88,6 +88,8 @@ def _settled(
     count, whole = len(graph.sightings), replace(graph, sightings=[*graph.sightings, *sightings])
     state = graph.at
     weights = np.ones(len(whole.sightings))
+    largest: list[float] = []
+    progress("closing loops", 0.0, f"{len(loops)} loops")
     informations = np.array([s.information for s in sightings])
     for steps in range(1, _MOST_STEPS + 1):
         state, x = whole.step(state, weights)
@@ -96,8 +98,11 @@ def _settled(
         if width > 1.0:
             width = max(1.0, min(width, 2.0 * float(squares.max(initial=0.0)) / _OUTLIER) / _NARROWER)
         weights[count:] = (width * _OUTLIER / (squares + width * _OUTLIER)) ** 2
-        progress("closing loops", steps / _MOST_STEPS, f"{len(loops)} loops")
-        if width == 1.0 and float(np.abs(x).max()) < _SMALL:
+        largest.append(float(np.abs(x).max()))
+        # Steps shrink by about the same factor each.
+        part = np.log(largest[0] / max(_SMALL, largest[-1])) / np.log(max(2.0, largest[0] / _SMALL))
+        progress("closing loops", float(np.clip(part, 0.0, 1.0)), f"{len(loops)} loops, step {steps}")
+        if width == 1.0 and largest[-1] < _SMALL:
             break
     progress("closing loops", 1.0, f"{len(loops)} loops")
     return state, weights[count:]

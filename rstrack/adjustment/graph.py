@@ -9,22 +9,19 @@ the model was made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.linalg import splu
 
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.chain import KeyframeModel
 from rstrack.adjustment.imu import Equations, ImuResult, ImuState, ImuTerm
+from rstrack.adjustment.system import BlockSystem, Layout
 from rstrack.alignment.priors import ACCELERATION, acceleration_sigmas
-
-# Information that holds the first control point, in m⁻² and rad⁻²: the gauge.
-_HELD = 1e14
 
 
 @dataclass(frozen=True)
@@ -86,6 +83,8 @@ class Graph:
     sightings: Sequence[Sighting]
     keeps_motion: bool = True
     imu: ImuTerm | None = None
+    # That of the last system: only numbers change from step to step.
+    _layouts: list[Layout] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def weakened(self, spread: float) -> Graph:
         """With frames and sightings so many times as uncertain (σ)."""
@@ -108,10 +107,8 @@ class Graph:
 
     def _system(self, state: State, weights: FloatArray | None) -> _System:
         others = 0 if self.imu is None or state.imu is None else len(state.imu)
-        system = _System(len(state.spline.control_points), list(state.keyframes), others)
-        moved_points = state.spline.control_points @ se3.inverse(self.at.spline.control_points)
-        for seen in self.seen:
-            system.add_seen(seen, state, self.at, moved_points)
+        system = _System(len(state.spline.control_points), list(state.keyframes), others, self._layouts)
+        system.add_seen(self._stacked, state, self.at)
         if self.sightings:
             system.add_sightings(self.sightings, state, np.ones(len(self.sightings)) if weights is None else weights)
         accelerations = ACCELERATION
@@ -123,21 +120,60 @@ class Graph:
         system.add_smoothness(state.spline, before, accelerations)
         return system
 
+    @cached_property
+    def _stacked(self) -> _Stacked:
+        return _Stacked.of(self.seen, self.at)
 
-@dataclass
-class _System:
-    """Blocks of the upper triangle of H and of g, of `points` control points, then the keyframes, then `others`."""
 
-    points: int
-    keyframes: list[int]
-    others: int = 0
-    _rows: list[IntArray] = field(default_factory=list)
-    _columns: list[IntArray] = field(default_factory=list)
-    _blocks: list[FloatArray] = field(default_factory=list)
+@dataclass(frozen=True)
+class _Stacked:
+    """All keyframes' models one after the other: a row for each control point that one has, r in all.
 
-    def __post_init__(self) -> None:
-        self._number = {k: self.points + n for n, k in enumerate(self.keyframes)}
-        self.g = np.zeros((self.points + len(self.keyframes) + self.others, 6))
+    numbers (r,): of the control points. model (r,): whose row it is. keyframes (p,): of the p models, by their place
+    among the state's, −1 without one; middles (p,): rows of their middles. gradient (r, 6): where they were made.
+    pairs: for each d rows (k,), and the blocks (k, 6, 6) of their control points and those of the rows d later.
+    """
+
+    numbers: IntArray
+    model: IntArray
+    keyframes: IntArray
+    middles: IntArray
+    gradient: FloatArray
+    pairs: list[tuple[IntArray, FloatArray]]
+
+    @classmethod
+    def of(cls, seen: Sequence[KeyframeModel], at: State) -> _Stacked:
+        points, place = len(at.spline.control_points), {k: n for n, k in enumerate(at.keyframes)}
+        seen = [each for each in seen if min(len(each.band), points - each.band.first) > 0]
+        counts = [min(len(each.band), points - each.band.first) for each in seen]
+        begins = np.cumsum([0, *counts])
+        numbers = [each.band.first + np.arange(n) for each, n in zip(seen, counts, strict=True)]
+        gradient = np.zeros((begins[-1], 6))
+        parts: list[list[tuple[IntArray, FloatArray]]] = []
+        for each, begin, n in zip(seen, begins, counts, strict=False):
+            if each.gradient is not None:
+                gradient[begin : begin + n] = each.gradient[:n]
+            width = min(n, each.band.blocks.shape[1])
+            parts += [[] for _ in range(width - len(parts))]
+            for d in range(width):
+                parts[d].append((begin + np.arange(n - d), each.band.blocks[: n - d, d].astype(np.float64)))
+        return cls(
+            np.concatenate([*numbers, np.zeros(0, int)]),
+            np.repeat(np.arange(len(seen)), counts),
+            np.array([-1 if each.keyframe is None else place[each.keyframe] for each in seen], int),
+            begins[:-1] + np.array(counts, int) // 2,
+            gradient,
+            [(np.concatenate([rows for rows, _ in of_d]), np.concatenate([H for _, H in of_d])) for of_d in parts],
+        )  # fmt: skip
+
+
+class _System(BlockSystem):
+    """Of `points` control points, then the keyframes, then `others`."""
+
+    def __init__(self, points: int, keyframes: list[int], others: int, layouts: list[Layout]) -> None:
+        super().__init__(points + len(keyframes) + others, layouts)
+        self.points = points
+        self._number = {k: points + n for n, k in enumerate(keyframes)}
 
     def add(self, sums: Equations) -> None:
         """Equations of any blocks, of which numbers below zero count from the end."""
@@ -147,41 +183,39 @@ class _System:
         H = sums.H.reshape(n, k, 6, k, 6)
         for a in range(k):
             for b in range(a, k):
-                self._put(numbers[:, a], numbers[:, b], H[:, a, :, b])
+                self.put(numbers[:, a], numbers[:, b], H[:, a, :, b])
 
-    def add_seen(self, seen: KeyframeModel, state: State, at: State, moved_points: FloatArray) -> None:
-        """A keyframe's frames."""
-        band = seen.band
-        n = min(len(band), self.points - band.first)
-        numbers = band.first + np.arange(n)
-        own = moved_points[numbers]
-        E = own[n // 2]
-        if seen.keyframe is not None:
-            E = state.keyframes[seen.keyframe] @ se3.inverse(at.keyframes[seen.keyframe])
-        x = se3.log(se3.inverse(E) @ own)
-        A = se3.left_jacobian_inv(x) @ se3.adjoint(se3.inverse(E))
-        Hx, whole = np.zeros((n, 6)), np.zeros((n, 6, 6))
-        if seen.gradient is not None:
-            Hx += seen.gradient[:n]
-        for d in range(band.blocks.shape[1]):
-            rows = np.arange(n - d)
-            if not len(rows):
-                break
-            blocks = band.blocks[: n - d, d].astype(np.float64)
+    def add_seen(self, seen: _Stacked, state: State, at: State) -> None:
+        """All keyframes' frames."""
+        if not len(seen.numbers):
+            return
+        numbers, model = seen.numbers, seen.model
+        own = state.spline.control_points[numbers] @ se3.inverse(at.spline.control_points[numbers])
+        E = own[seen.middles]
+        is_with = seen.keyframes >= 0
+        K, K_at = (np.array(list(each.keyframes.values())).reshape(-1, 4, 4) for each in (state, at))
+        moved = seen.keyframes[is_with]
+        E[is_with] = K[moved] @ se3.inverse(K_at[moved])
+        E_inv = se3.inverse(E)
+        x = se3.log(E_inv[model] @ own)
+        A = se3.left_jacobian_inv(x) @ se3.adjoint(E_inv)[model]
+        At = np.swapaxes(A, 1, 2)
+        Hx, whole = seen.gradient.copy(), np.zeros((len(numbers), 6, 6))
+        for d, (rows, blocks) in enumerate(seen.pairs):
             Hx[rows] += (blocks @ x[rows + d][..., None])[..., 0]
-            turned = np.swapaxes(A[rows], 1, 2) @ blocks @ A[rows + d]
+            turned = At[rows] @ blocks @ A[rows + d]
             whole[rows] += turned
             if d:
                 Hx[rows + d] += (np.swapaxes(blocks, 1, 2) @ x[rows][..., None])[..., 0]
                 whole[rows + d] += np.swapaxes(turned, 1, 2)
-            self._put(numbers[rows], numbers[rows + d], turned)
-        g = (np.swapaxes(A, 1, 2) @ Hx[..., None])[..., 0]
-        self.g[numbers] += g
-        if seen.keyframe is not None:
-            k = self._number[seen.keyframe]
-            self._put(numbers, np.full(n, k), -whole)
-            self._put(np.array([k]), np.array([k]), whole.sum(axis=0)[None])
-            self.g[k] -= g.sum(axis=0)
+            self.put(numbers[rows], numbers[rows + d], turned)
+        g = (At @ Hx[..., None])[..., 0]
+        np.add.at(self.g, numbers, g)
+        with_keyframe = np.flatnonzero(is_with[model])
+        k = self.points + seen.keyframes[model[with_keyframe]]
+        self.put(numbers[with_keyframe], k, -whole[with_keyframe])
+        self.put(k, k, whole[with_keyframe])
+        np.add.at(self.g, k, -g[with_keyframe])
 
     def add_sightings(self, sightings: Sequence[Sighting], state: State, weights: FloatArray) -> None:
         """Some sightings (n), with weights (n,)."""
@@ -196,7 +230,7 @@ class _System:
         np.add.at(self.g, numbers, (weighted @ e[:, None, :, None])[..., 0])
         for a in range(5):
             for b in range(a, 5):
-                self._put(numbers[:, a], numbers[:, b], weighted[:, a] @ J[:, b])
+                self.put(numbers[:, a], numbers[:, b], weighted[:, a] @ J[:, b])
 
     def add_smoothness(self, spline: Spline, before: FloatArray, accelerations: FloatArray) -> None:
         """Small accelerations, of σ (6,) in m/s² and rad/s², beside those of increments `before` (n, 6) from control
@@ -211,44 +245,4 @@ class _System:
         for a in range(3):
             np.add.at(self.g, np.arange(n) + a, (weighted[:, a] @ r[..., None])[..., 0])
             for b in range(a, 3):
-                self._put(np.arange(n) + a, np.arange(n) + b, weighted[:, a] @ J[:, b])
-
-    def solved(self) -> FloatArray:
-        """Increments (n, 6) of all blocks. Raises numpy.linalg.LinAlgError."""
-        inverted = self._inverted()
-        x = -inverted(self.g.ravel())
-        if not np.isfinite(x).all():
-            raise np.linalg.LinAlgError("the graph's system has no finite solution")
-        return np.asarray(x.reshape(-1, 6))
-
-    def covariance(self) -> Callable[[IntArray], FloatArray]:
-        """Of unknowns by their numbers (k,): (k, k). Raises numpy.linalg.LinAlgError."""
-        inverted, size = self._inverted(), self.g.size
-        return lambda numbers: np.stack([inverted(np.eye(1, size, int(k) % size)[0])[numbers] for k in numbers])
-
-    def _inverted(self) -> Callable[[FloatArray], FloatArray]:
-        """Takes a vector to H⁻¹ times it."""
-        size = self.g.size
-        self._put(np.zeros(1, int), np.zeros(1, int), _HELD * np.eye(6)[None])
-        rows, columns, blocks = (np.concatenate(a) for a in (self._rows, self._columns, self._blocks))
-        inner = np.arange(6)
-        i = np.broadcast_to(6 * rows[:, None, None] + inner[:, None], blocks.shape).ravel().astype(np.int32)
-        j = np.broadcast_to(6 * columns[:, None, None] + inner, blocks.shape).ravel().astype(np.int32)
-        # Blocks on the diagonal are whole; of the others there is the upper one only.
-        values = np.where((rows == columns)[:, None, None], 0.5, 1.0) * blocks
-        upper = scipy.sparse.coo_matrix((values.ravel(), (i, j)), shape=(size, size)).tocsc()
-        H = scipy.sparse.csc_matrix(upper + upper.T)
-        scale = 1.0 / np.sqrt(np.maximum(H.diagonal(), 1e-300))
-        scaling = scipy.sparse.diags(scale)
-        scaled = scipy.sparse.csc_matrix(scaling @ H @ scaling)
-        symmetric = {"SymmetricMode": True}
-        try:
-            factors = splu(scaled, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
-        except RuntimeError as error:
-            raise np.linalg.LinAlgError(f"the graph's system has no solution ({error})") from None
-        return lambda b: np.asarray(scale * factors.solve(scale * b))
-
-    def _put(self, rows: IntArray, columns: IntArray, blocks: FloatArray) -> None:
-        self._rows.append(np.asarray(rows))
-        self._columns.append(np.asarray(columns))
-        self._blocks.append(blocks)
+                self.put(np.arange(n) + a, np.arange(n) + b, weighted[:, a] @ J[:, b])

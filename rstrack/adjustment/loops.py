@@ -80,6 +80,7 @@ class LoopSearch:
         """All loops among the keyframes."""
         track = self._track(self.archive.indices)
         loops: list[Loop] = []
+        progress("loops", 0.0, f"{len(track.order)} keyframes")
         for n in range(len(track.order)):
             loops += self._loops_of(track, n)
             progress("loops", (n + 1) / len(track.order), f"{len(loops)} loops")

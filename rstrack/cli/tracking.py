@@ -93,12 +93,14 @@ def track(
             result = run.track(dataset, tracker, out, chosen, noise, progress, resume, watch, gravity, note)
             if viewer is not None:
                 viewer.corrected(result.estimate.T_world_depth)
+        progress("evaluating", 0.0, "")
+        errors = add_errors(out, truth, result.estimate, result.online)
+        progress("evaluating", 1.0, "")
     (out / CALIBRATION).unlink(missing_ok=True)  # of an earlier run in this folder
     if found is not None:
         atomic_write(out / "camera.yaml", camera_file_of(found).encode())
         write_record(found, out / CALIBRATION)
         print(found.text())
-    errors = add_errors(out, truth, result.estimate, result.online)
     print("\n".join(text for text in (result.text(), errors) if text))
     if found is None and dataset.rig.sigma.k1 >= UNDISTORTED_K1:
         print(

@@ -71,7 +71,9 @@ def track(
     start_s = time.perf_counter() - begin
     end, error = feed(run, progress, watch, note)
     result = finish(run, end, error, start_s, gravity, progress)
+    progress("writing", 0.0, str(out))
     write(run, result, out)
+    progress("writing", 1.0, str(out))
     return result
 
 

@@ -12,7 +12,7 @@ from util import random_spline
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.adjustment import graph as graph_module
+from rstrack.adjustment import system
 from rstrack.adjustment.chain import BandedHessian, KeyframeModel
 from rstrack.adjustment.closing import closed
 from rstrack.adjustment.graph import Graph, Sighting, State
@@ -117,7 +117,7 @@ def test_steps_end_where_least_squares_do() -> None:
         sigma[:2] *= 0.1
         sigma[-2:] *= 0.1
         out.append(((omega[1:] - omega[:-1]) / sigma).ravel())
-        out.append(np.sqrt(graph_module._HELD) * se3.log(state.spline.control_points[0] @ se3.inverse(start)))
+        out.append(np.sqrt(system._HELD) * se3.log(state.spline.control_points[0] @ se3.inverse(start)))
         return np.concatenate(out)
 
     start = at.spline.control_points[0]
