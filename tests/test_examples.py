@@ -221,7 +221,7 @@ def test_the_live_loop_says_what_it_dropped(tmp_path: Path, capsys: pytest.Captu
     words = [str(root), "--method", "rs-g", "--seconds", "0.3", "--hz", "30", "--check"]
     load("live_loop").main(words, clock, clock.sleep)
     first, second, third = capsys.readouterr().out.splitlines()
-    assert first == "9 frames in 0.3 s: 9 fed, 0 dropped, 0 lost"
+    assert first == "9 frames in 0.3 s: 9 fed, 0 dropped, 0 lost, 0 cut short"
     assert second.startswith("latency, ms: median 0.0, 95 % 0.0") and third.endswith("the same bits")
     assert clock.now == pytest.approx(5.0 + 8 / 30)
 

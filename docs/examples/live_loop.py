@@ -6,8 +6,8 @@ As with a camera, one frame waits at most, and a newer one takes its place. Fram
 and kernels compiled. A recording that is shorter than that is played forth and back; on the way back the lines of a
 rolling shutter run backwards in time as well, so that poses are worse there.
 
-The clock decides which frames survive, and nothing else: the survivors fed again without a clock give the same bits
-(--check).
+Without --budget-ms the clock decides which frames survive, and nothing else: the survivors fed again without a clock
+give the same bits (--check).
 """
 
 from __future__ import annotations
@@ -89,6 +89,9 @@ def main(
     parser.add_argument("--method", default="rs-pg", help="one without an IMU")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--hz", type=float, default=30.0, help="frames a second that the clock says have arrived")
+    parser.add_argument(
+        "--budget-ms", type=float, help="of a frame, as of rstrack track; poses depend on the clock then"
+    )
     parser.add_argument("--check", action="store_true", help="feed the survivors again without a clock: the same bits?")
     given = parser.parse_args(words)
 
@@ -97,7 +100,7 @@ def main(
     interval_s = dataset.interval_s(range(len(frames)))
 
     def new() -> AnyTracker:
-        return make_tracker(rig, Options(method=given.method), interval_s=interval_s)
+        return make_tracker(rig, Options(method=given.method, budget_ms=given.budget_ms), interval_s=interval_s)
 
     def camera(n: int) -> Frame:
         return played(frames, rig, n)
@@ -107,8 +110,10 @@ def main(
         warm.feed(camera(n))
     tracker = new()
     fed, seconds = live(tracker, camera, count, given.hz, clock, sleep)
-    lost = sum(report.lost for report in tracker.reports)
-    print(f"{count} frames in {given.seconds:g} s: {len(fed)} fed, {count - len(fed)} dropped, {lost} lost")
+    lost, cut = (sum(getattr(report, name) for report in tracker.reports) for name in ("lost", "is_cut"))
+    print(
+        f"{count} frames in {given.seconds:g} s: {len(fed)} fed, {count - len(fed)} dropped, {lost} lost, {cut} cut short"
+    )
     median, p95, p99 = 1e3 * np.percentile(seconds, [50, 95, 99])
     worst = int(seconds.argmax())
     print(
