@@ -111,9 +111,8 @@ def main(
     tracker = new()
     fed, seconds = live(tracker, camera, count, given.hz, clock, sleep)
     lost, cut = (sum(getattr(report, name) for report in tracker.reports) for name in ("lost", "is_cut"))
-    print(
-        f"{count} frames in {given.seconds:g} s: {len(fed)} fed, {count - len(fed)} dropped, {lost} lost, {cut} cut short"
-    )
+    told = f"{len(fed)} fed, {count - len(fed)} dropped, {lost} lost, {cut} cut short"
+    print(f"{count} frames in {given.seconds:g} s: {told}")
     median, p95, p99 = 1e3 * np.percentile(seconds, [50, 95, 99])
     worst = int(seconds.argmax())
     print(
