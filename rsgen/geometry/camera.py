@@ -130,7 +130,7 @@ class Camera:
         """Whether pixels (..., 2) lie in the image: −½ ≤ u < width − ½ and −½ ≤ v < height − ½. NaN does not."""
         uv = np.asarray(uv, dtype=np.float64)
         inside = (uv >= -0.5) & (uv < np.array([self.width, self.height]) - 0.5)
-        return np.asarray(inside.all(axis=-1))
+        return np.asarray(inside[..., 0] & inside[..., 1])  # all(axis=-1) takes ten times as long
 
     def unproject(self, uv: npt.ArrayLike) -> FloatArray:
         """Rays (..., 3) with z = 1 through pixels (..., 2); NaN where no direction is seen there (see `max_radius`)."""
@@ -162,7 +162,8 @@ class Camera:
     def _normalise(self, p_cam: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Normalised coordinates (..., 2), 1/z (...,) and whether the camera is defined there; 0 where it is not."""
         p = np.asarray(p_cam, dtype=np.float64)
-        front = np.isfinite(p).all(axis=-1) & (p[..., 2] > _MIN_DEPTH)
+        finite = np.isfinite(p)
+        front = finite[..., 0] & finite[..., 1] & finite[..., 2] & (p[..., 2] > _MIN_DEPTH)
         inv_z = np.where(front, 1.0 / np.where(front, p[..., 2], 1.0), 0.0)
         xy = np.where(front[..., None], p[..., :2], 0.0) * inv_z[..., None]
         valid = front & (np.hypot(xy[..., 0], xy[..., 1]) < self.max_radius)
