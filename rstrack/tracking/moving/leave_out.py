@@ -12,12 +12,13 @@ from typing import Any
 
 import cv2
 import drjit as dr
+import numba
 import numpy as np
 
 from rsgen.device.arrays import Engine
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.free_space import Free, FreeSpace, Grid, SeenFrom, grid_of
+from rstrack.alignment.free_space import Free, FreeSpace, Grid, Look, SeenFrom, grid_of
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH
@@ -49,13 +50,13 @@ def moving(seen: SeenFrom, sigma_depth: float, median_depth: float, sigma_intens
     sigma_depth (m): scale of depth's residuals at median_depth (m), growing with the square of depth; sigma_intensity:
     that of intensity's. Nothing where too little stands in free space to tell.
     """
-    scale, least = _scales(seen.z, sigma_depth, median_depth)
-    far = np.nan_to_num(seen.free) > least
+    far = _in_free_space(seen.free, seen.z, sigma_depth, median_depth)
     seeds = _opened(far)
     if not _is_enough(seeds):
         return np.zeros_like(seeds)
+    scale, least = _scales(seen.z, sigma_depth, median_depth)
     # Behind what is seen there nothing is known.
-    hidden = np.nan_to_num(seen.apart) < -least
+    hidden = seen.apart < -least
     depth = (np.where(hidden, np.nan, seen.apart) / scale).astype(np.float32)
     odd = far | _at_odds(depth, seen.intensity, sigma_intensity)
     grown = _grown(seeds, odd, hidden | ~np.isfinite(seen.apart), hidden | seen.outside, seen.z)
@@ -64,8 +65,7 @@ def moving(seen: SeenFrom, sigma_depth: float, median_depth: float, sigma_intens
 
 def anything(near: Free, sigma_depth: float, median_depth: float) -> bool:
     """Whether enough stands in free space for `moving` to find something."""
-    _, least = _scales(near.z, sigma_depth, median_depth)
-    return _is_enough(_opened(np.nan_to_num(near.free) > least))
+    return _is_enough(_opened(_in_free_space(near.free, near.z, sigma_depth, median_depth)))
 
 
 def _is_enough(seeds: Mask) -> bool:
@@ -92,11 +92,18 @@ def moving_with(seen: SeenFrom, left_out: Mask, sigma_depth: float, median_depth
     return _widened(grown) if seeds.any() else nowhere
 
 
+@numba.njit(cache=True)
 def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Grid]:
     """σ (m) at depths z, and how far before what was seen something has to stand to be in free space."""
-    z = np.nan_to_num(z)
-    scale = np.maximum(sigma_depth * np.square(z / np.float32(median_depth)), 1e-6)
-    return scale.astype(np.float32), np.maximum(_BEFORE_M + EDGE * z, _BEFORE_SIGMAS * scale)
+    share = z / np.float32(median_depth)
+    scale = np.maximum(np.float32(sigma_depth) * share * share, np.float32(1e-6))
+    return scale, np.maximum(np.float32(_BEFORE_M) + np.float32(EDGE) * z, np.float32(_BEFORE_SIGMAS) * scale)
+
+
+@numba.njit(cache=True)
+def _in_free_space(seen: Grid, z: Grid, sigma_depth: float, median_depth: float) -> Mask:
+    """Pixels (gh, gw) at depths z that stand so far (`seen`, m) before what was seen there."""
+    return np.asarray(seen > _scales(z, sigma_depth, median_depth)[1])
 
 
 def _opened(mask: Mask) -> Mask:
@@ -211,23 +218,22 @@ def _found(
     def differences() -> Any:
         return space.intensity(ref, image, brightness, state.spline)
 
-    gone = _moving(space, space.before(ref, depth.occluder, state.spline), scales, sigma_intensity,
-                   lambda: space.seen_from(ref, depth.occluder, differences(), state.spline))  # fmt: skip
+    of_ref, of_frame = space.look(ref, depth.occluder, state.spline), space.look(depth.occluder, ref, state.spline)
+    gone = _moving(space, of_ref, scales, sigma_intensity, differences)
     if gone is None:
         return nothing
-    # What falls where something is gone may be that in another place.
-    rest = without(e, ref, gone) if gone.any() else ref
-
-    def look() -> SeenFrom:
-        return space.seen_from(depth.occluder, rest, differences(), state.spline)
-
-    came = _moving(space, space.before(depth.occluder, rest, state.spline), scales, sigma_intensity, look)
+    if gone.any():
+        # What falls where something is gone may be that in another place.
+        of_frame = space.look(depth.occluder, without(e, ref, gone), state.spline)
+    came = _moving(space, of_frame, scales, sigma_intensity, differences)
     if came is None:
         return nothing
     if color is None and before is not None and before.left_out is not None:
         # Without colours only its place tells, in the keyframe's holes, what was left out of the frame before. That
         # creeps over what rests beside it; with colours it costs more than it gains.
-        came = came | (unseen(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
+        came = came | (
+            unseen(of_frame.closer(differences()), *scales) & _as_before(space, depth, before, state.spline, scales)
+        )
     return LeftOut(
         without_pixels(e, depth, came, grid_of(depth.exposure.lens)[1]) if came.any() else depth,
         gone if gone.any() else None,
@@ -235,16 +241,17 @@ def _found(
 
 
 def _moving(
-    space: FreeSpace, near: Free, scales: tuple[float, float], sigma_intensity: float, look: Callable[[], SeenFrom]
+    space: FreeSpace, look: Look, scales: tuple[float, float], sigma_intensity: float, differences: Callable[[], Any]
 ) -> Mask | None:
-    """Pixels of what moves, None where so much seems to that the pose is wrong. look: closer, where something may move.
+    """Pixels of what moves, None where so much seems to that the pose is wrong.
 
-    scales (m): as `moving` takes them.
+    scales (m): as `moving` takes them; differences: of intensities, asked for where something may move.
     """
+    near = look.near
     with space.device.timer("what moves: regions"):
         if not anything(near, *scales):
             return np.zeros(near.z.shape, bool)
-    seen = look()
+    seen = look.closer(differences())
     with space.device.timer("what moves: regions"):
         found = moving(seen, *scales, sigma_intensity)
     return None if _share(found, seen) > _MOST else found
@@ -256,7 +263,7 @@ def _as_before(
     """Pixels (gh, gw) of a frame that show, at about the same place, what has been left out of another one."""
     assert other.left_out is not None
     left_out = space.device.e.upload(other.left_out.astype(np.float32))
-    seen = space.seen_from(depth.occluder, other.occluder, left_out, spline)
+    seen = space.look(depth.occluder, other.occluder, spline).closer(left_out)
     with space.device.timer("what moves: regions"):
         return moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, *scales)
 
