@@ -152,8 +152,10 @@ class RollingProjection:
         )
 
 
-def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any) -> RollingProjection:
+def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any, first: Any = 0) -> RollingProjection:
     """Solve equation (3) for points of the base frame; `table` holds FROM_BASE floats for each line.
+
+    first: entry of line 0, where the table has the lines of several images.
 
     Newton from the middle line with constant velocity, then from the line that this finds (paper, section 3.7), at most
     three lines off at 0.5 m/s and 1 rad/s: what is left is below 3e-4 px, most of it rounding.
@@ -168,11 +170,11 @@ def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any)
         )
     last = lens.lines - 1
     middle = float(last // 2)
-    at, _, speed, pixel_speed, slope = _look(lens, table, UInt(last // 2), p_base)
+    at, _, speed, pixel_speed, slope = _look(lens, table, UInt(last // 2) + first, p_base)
     line = middle + (lens.line_of(at.x, at.y) - middle) / (1.0 - slope)
     valid = at.valid
     row = UInt(Int(dr.round(dr.clip(dr.select(dr.isfinite(line), line, middle), 0.0, float(last)))))
-    at, M, speed, pixel_speed, slope = _look(lens, table, row, p_base)
+    at, M, speed, pixel_speed, slope = _look(lens, table, row + first, p_base)
     gain = dr.rcp(1.0 - slope)
     ahead = (lens.line_of(at.x, at.y) - Float(row)) * gain
     # A shutter that the picture outruns sees a point twice or never.

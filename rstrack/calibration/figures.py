@@ -104,7 +104,7 @@ def residuals_at(windows: Sequence[RecordingWindow], terms: PairTerms, p: Parame
 
     Evaluated on copies: the windows keep their scales and their brightness.
     """
-    scales = np.array([_scales(replace(each, brightness=dict(each.brightness)), terms, p) for each in windows])
+    scales = np.array([_scales(replace(each, brightness=each.brightness.copy()), terms, p) for each in windows])
     return _medians(np.maximum(extrapolated(np.moveaxis(scales, 1, 0)), (FLOOR_DEPTH, FLOOR_INTENSITY)))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from rsgen.array_types import BoolArray, FloatArray
 from rstrack.alignment.normal_equations import AndersonMixing, Eliminated
@@ -75,7 +75,7 @@ class Solution:
         """Covariance (31, 31), to which `sigmas` belong; 0 of what is not free."""
         known = self.known[np.ix_(self.free, self.free)]
         C, _, _ = posterior(self.A, self.b, known)
-        factor = float(stats.t.ppf(0.975, max(1.0, len(self.b) - 1.0))) / 1.96
+        factor = float(special.stdtrit(max(1.0, len(self.b) - 1.0), 0.975)) / 1.96
         formal = np.sqrt(np.maximum(np.diag(C), 1e-300))
         bound = np.sqrt(np.divide(1.0, np.diag(known), out=np.full(len(C), np.inf), where=np.diag(known) > 0.0))
         scale = np.minimum(factor * formal, bound) / formal
@@ -95,7 +95,7 @@ class Solution:
         formal = np.linalg.pinv(self.A.sum(axis=0), hermitian=True)
         M = np.linalg.solve(formal[np.ix_(of, of)], C[np.ix_(of, of)])
         trace, square = float(np.trace(M)), float(np.trace(M @ M))
-        return float(stats.chi2.sf(2.0 * max(gain, 0.0) * trace / square, trace**2 / square))
+        return float(special.chdtrc(trace**2 / square, 2.0 * max(gain, 0.0) * trace / square))
 
     def gain_over(self, values: Parameters, which: BoolArray) -> float:
         """By how much less likely images are with `which` (31,) of the unknowns at `values`, all else moved to make up
@@ -198,7 +198,7 @@ def _blind(windows: Sequence[RecordingWindow], terms: PairTerms) -> FloatArray:
     end.
     """
     turn = _BLIND_PX / terms.color.camera.fx
-    depth = float(np.median([view.surface.median_depth for window in windows for view in window.views]))
+    depth = float(np.median(np.concatenate([window.images.median_depth for window in windows])))
     stamps = [view.depth.stamp for window in windows for view in window.views]
     drift = _BLIND_S / max(0.5 * (max(stamps) - min(stamps)), 1e-3)
     lens = turn * np.array([1.0, 1.0, 1.0, 1.0, 4.0, 8.0, 1.0, 1.0, 16.0])

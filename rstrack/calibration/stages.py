@@ -128,7 +128,7 @@ def _paid(
     if plainly or not solution.finished:
         return windows, solution, False
     without = solution.free & ~LENSES
-    plain = [replace(each, brightness=dict(each.brightness)) for each in windows]
+    plain = [replace(each, brightness=each.brightness.copy()) for each in windows]
     start = known.values.moved(np.where(without | held, solution.values.since(known.values), 0.0))
     watch = progress_watch(progress, 0.8)
     other = solve(plain, terms, start, without, _FINE, watch, known, depth_counts=depth_counts)

@@ -11,7 +11,16 @@ from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.pairs.images import ImageTiming, averaged, intensity_bound, span, surface_of
+from rstrack.calibration.pairs.images import (
+    DepthSurface,
+    Float32Image,
+    ImageTiming,
+    averaged,
+    intensity_bound,
+    span,
+    surface_of,
+    window_images,
+)
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
@@ -19,6 +28,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.rig import Frame, Image
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import color_image, intensity
+from rstrack.images.sampling import level_size
 from rstrack.options import Method, Options
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 from rstrack.tracking.first_look.depth_track import thinned, through
@@ -127,12 +137,24 @@ def load_window(
 
     Raises UserError: an image that cannot be read.
     """
-    views = [_view(terms, dataset, k, options.max_depth) for k in frames]
-    begin, end = span([taken for v in views for taken in (v.depth, v.color) if taken is not None], p)
+    e, camera, surfaces, bounds = terms.e, dataset.rig.color_camera, [], []
+    colors: list[list[Float32Image]] = []
+    for k in frames:
+        surfaces.append(_surface(dataset, k, options.max_depth))
+        colors.append([])
+        if dataset.groups[k]:
+            color = dataset.images.color(dataset.groups[k][0])
+            shown = color_image(e, Exposure(terms.color, 0.0, np.eye(4)), color).levels
+            sizes = [[level_size(size, n) for size in (camera.height, camera.width)] for n in range(len(shown))]
+            colors[-1] = [e.download(level, tuple(size)) for level, size in zip(shown, sizes, strict=True)]
+            bounds.append(intensity_bound(intensity(color), camera.fx, surfaces[-1].median_depth))
+    images = window_images(e, surfaces, colors, max(bounds), terms.stride)
+    views = [_view(terms, dataset, k) for k in frames]
+    begin, end = span([taken for view in views for taken in (view.depth, view.color)], p)
     knot_s = options.knots_s()
     t0 = begin - _MARGIN_S - options.knot_phase * knot_s
     count = int(np.ceil((end + _MARGIN_S - t0) / knot_s)) + 3
-    return RecordingWindow(views, like(track, t0, knot_s, count))
+    return RecordingWindow(views, images, like(track, t0, knot_s, count), np.zeros((len(views), len(views), 2)))
 
 
 def like(track: Spline, t0: float, dt: float, count: int) -> Spline:
@@ -143,18 +165,16 @@ def like(track: Spline, t0: float, dt: float, count: int) -> Spline:
     return through(poses @ se3.exp((knots - inside)[:, None] * velocity), t0, dt)
 
 
-def _view(terms: PairTerms, dataset: Dataset, k: int, max_depth: float) -> WindowFrame:
-    e, rig = terms.e, dataset.rig
-    z = dataset.images.depth(k)
+def _view(terms: PairTerms, dataset: Dataset, k: int) -> WindowFrame:
+    rig, stamp = dataset.rig, float(dataset.stamps[k])
+    taken = float(dataset.color_stamps[dataset.groups[k][0]]) if dataset.groups[k] else stamp
+    depth = ImageTiming(terms.depth, stamp, rig.depth_shutter.exposure_s, True)
+    color = ImageTiming(terms.color, taken, rig.color_shutter.exposure_s, False)
+    return WindowFrame(depth, color, bool(dataset.groups[k]))
+
+
+def _surface(dataset: Dataset, k: int, max_depth: float) -> DepthSurface:
+    z, rig = dataset.images.depth(k), dataset.rig
     rho = averaged(np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=(z > 0.0) & (z < max_depth)))
-    z = np.divide(np.float32(1.0), rho, out=np.zeros_like(z), where=rho > 0.0)
-    depth = ImageTiming(terms.depth, float(dataset.stamps[k]), rig.depth_shutter.exposure_s, True)
-    camera, baseline = rig.depth_camera, _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
-    view = WindowFrame(depth, e.upload(z), surface_of(e, rho, camera.fx, camera.fy, baseline))
-    if dataset.groups[k]:
-        i = dataset.groups[k][0]
-        color = dataset.images.color(i)
-        view.color = ImageTiming(terms.color, float(dataset.color_stamps[i]), rig.color_shutter.exposure_s, False)
-        view.levels = color_image(e, Exposure(terms.color, 0.0, np.eye(4)), color).levels
-        view.bound = intensity_bound(intensity(color), rig.color_camera.fx, view.surface.median_depth)
-    return view
+    baseline = _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
+    return surface_of(rho, rig.depth_camera.fx, rig.depth_camera.fy, baseline)

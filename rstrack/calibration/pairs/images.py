@@ -4,7 +4,7 @@ poses."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,16 +12,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
-from rstrack.alignment.normal_equations import by_points
-from rstrack.calibration.parameters import DRIFT, EXTRINSICS, POSES, Parameters
+from rstrack.calibration.parameters import DRIFT, EXTRINSICS, Parameters
 from rstrack.images.line_poses import rows_of
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import depth_scaling
@@ -31,6 +31,10 @@ from rstrack.keyframes.surface import surface_bends, surface_slopes
 _WINDOW = 1.0 / 160.0
 # Inverse depth larger by this part may hide a point from the colour camera.
 _HIDES = 0.2
+# Lines between which poses are interpolated: about every half of a millisecond.
+_NODES = 60
+ACROSS = 6
+"""Images in a row of an atlas, which has as many rows at most: float32 places pixels to 2e-4 px still."""
 Float32Image = npt.NDArray[np.float32]
 
 
@@ -67,68 +71,96 @@ class ImageTiming:
 
 @dataclass(frozen=True)
 class LinePoses:
-    """The lines of an image for some spline and parameters.
+    """The lines of one camera's images for some spline and parameters.
 
-    T_world_cam (lines, 4, 4); twist (lines, 6): the camera's own per line delay. Derivatives of the twist, in the
-    world, of each block's middle: by the control points `first`, `first` + 1, ...: by_points (blocks, 6, 6k); by the
-    those parameters that move poses: by_parameters (blocks, 6, 10).
+    to_base (images, lines, 12), from_base (images, lines, 18): as `line_poses` has them, of a base frame. Derivatives
+    of the twist, in the base frame, of each block's middle: slopes (images, blocks, 6, 24 + m) by the four control
+    points from `first` (images, blocks) on, and by the m parameters `moved` (places among NAMES).
     """
 
-    T_world_cam: FloatArray
-    twist: FloatArray
-    first: int
-    by_points: FloatArray
-    by_parameters: FloatArray
-
-    def to_base(self, T_base_world: FloatArray) -> FloatArray:
-        """T_base_cam of each line (lines, 12): rotation row-major, translation."""
-        return rows_of(T_base_world @ self.T_world_cam)
-
-    def from_base(self, T_base_world: FloatArray) -> FloatArray:
-        """T_cam_base of each line and the camera's twist per line delay (lines, 18)."""
-        return np.concatenate([rows_of(se3.inverse(T_base_world @ self.T_world_cam)), self.twist], axis=1)
+    to_base: Float32Image
+    from_base: Float32Image
+    first: IntArray
+    slopes: FloatArray
+    moved: tuple[int, ...]
 
 
-def lines_of(images: Sequence[ImageTiming], spline: Spline, p: Parameters) -> list[LinePoses]:
+def lines_of(images: Sequence[ImageTiming], spline: Spline, p: Parameters, T_base_world: FloatArray) -> LinePoses:
     """Where the lines of images were, which one camera took, and what that depends on.
 
     A line's time is begin + readout l / lines: a later one moves its pose by its velocity. Extrinsics move the colour
     camera against the body, which is the depth camera: by −Ad(T_world_color) ε. All images at once: calls of the
     spline cost more than numbers do.
     """
-    if not images:
-        return []
     lens, is_depth = images[0].lens, images[0].is_depth
-    first, readout = np.array([taken.begin(p) for taken in images]).T[..., None]
-    count = lens.lines
-    blocks, _, per, _ = block_counts(lens, lens)
-    start = np.arange(blocks) * per
-    middle = 0.5 * (start + np.minimum(start + per, count) - 1) / count
-    # Times that a step too far has led out of the spline are brought back: the next one leads back.
-    t = np.clip(first + readout * np.concatenate([np.arange(count) / count, middle]), spline.t_begin, spline.t_end)
-    T_world_body, velocity = spline.pose_and_velocity(t)
+    begin = np.array([taken.begin(p) for taken in images])
     T_cam_body = np.eye(4) if is_depth else p.T_color_depth
-    T_world_cam = T_world_body[:, :count] @ se3.inverse(T_cam_body)
-    twist = readout[..., None] / count * velocity[:, :count] @ se3.adjoint(T_cam_body).T
 
-    Ad = se3.adjoint(T_world_body[:, count:])
-    w_world = (Ad @ velocity[:, count:, :, None])[..., 0]
-    by_parameters = np.zeros((len(images), blocks, 6, POSES))
-    if is_depth:
-        by_parameters[..., 0] = w_world * middle[:, None]
-    else:
-        by_parameters[..., 1] = w_world * middle[:, None]
-        by_parameters[..., 2] = w_world
+    def motion(lines: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times (images, n), poses T_base_body and the bodies' twists a second at lines (n,)."""
+        # Times that a step too far has led out of the spline are brought back: the next one leads back.
+        t = np.clip(begin[:, :1] + begin[:, 1:] * (lines / lens.lines), spline.t_begin, spline.t_end)
+        T_world_body, velocity = spline.pose_and_velocity(t)
+        return t, T_base_world @ T_world_body, velocity
+
+    blocks, _, per, _ = block_counts(lens, lens)
+    middle = _middles(blocks, per, lens.lines)
+    t, T_base_body, velocity = motion(middle)
+    Ad = se3.adjoint(T_base_body)
+    by_time = (Ad @ velocity[..., None])[..., 0]
+    by_readout = by_time * (middle / lens.lines)[:, None]
+    columns, moved = [by_readout[..., None]], (0,)
+    if not is_depth:
         since = np.array([taken.stamp - p.epoch_s for taken in images])
-        by_parameters[..., DRIFT] = w_world * since[:, None, None]
-        by_parameters[..., EXTRINSICS] = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
-    points, J = spline.pose_jacobian(t[:, count:])
-    found = []
-    for k, at in enumerate(points):
-        begin, several = int(at.min()), int(np.ptp(at)) + 4
-        moved = by_points(at, J[k], begin, several)
-        found.append(LinePoses(T_world_cam[k], twist[k], begin, moved, by_parameters[k]))
-    return found
+        by_drift = by_time * since[:, None, None]
+        by_pose = -Ad @ se3.adjoint(se3.inverse(T_cam_body))
+        columns = [*(by[..., None] for by in (by_readout, by_time, by_drift)), by_pose]
+        moved = (1, 2, DRIFT, *range(EXTRINSICS.start, EXTRINSICS.stop))
+    first, J = spline.pose_jacobian(t)
+    by_points = np.moveaxis(se3.adjoint(T_base_world) @ J, 2, 3).reshape(*first.shape, 6, 24)
+    tables = _tables(motion, begin[0, 1], lens.lines, T_cam_body)
+    return LinePoses(*tables, first, np.concatenate([by_points, *columns], axis=-1), moved)
+
+
+def _middles(blocks: int, per: int, lines: int) -> FloatArray:
+    """The middle (blocks,) of each block of `per` lines, of which the last may have fewer."""
+    first = np.arange(blocks) * per
+    return np.asarray(0.5 * (first + np.minimum(first + per, lines) - 1))
+
+
+def _tables(
+    motion: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]], readout_s: float, lines: int,
+    T_cam_body: FloatArray,
+) -> tuple[Float32Image, Float32Image]:  # fmt: skip
+    """to_base and from_base of `LinePoses`, by the motion at every few lines, as `line_poses` has it for one image.
+
+    A line d from such a one is at T exp(u d + ½ u̇ d²), to second order in d, with the twist u a line.
+    """
+    per = max(1, lines // _NODES)
+    count = -(-lines // per)
+    middle = _middles(count, per, lines)
+    _, T, velocity = motion(middle)
+    u = velocity * (readout_s / lines)
+    du = np.gradient(u, middle, axis=1) if count > 1 else np.zeros_like(u)
+    d = (np.arange(count * per) - middle.repeat(per)).reshape(count, per, 1).astype(np.float32)
+    W, dW = _algebra(u), _algebra(du)
+    square, one = W @ W, np.broadcast_to(np.eye(4), W.shape)
+    there = T @ np.stack([one, W, 0.5 * (square + dW)]) @ se3.inverse(T_cam_body)
+    back = T_cam_body @ np.stack([one, -W, 0.5 * (square - dW)]) @ se3.inverse(T)
+    twist = np.stack([u, du, np.zeros_like(u)]) @ se3.adjoint(T_cam_body).T
+
+    def at_lines(powers: FloatArray) -> Float32Image:
+        a, b, c = powers[:, :, :, None].astype(np.float32)
+        return (a + d * (b + d * c)).reshape(len(T), -1, powers.shape[-1])[:, :lines]
+
+    return at_lines(rows_of(there)), at_lines(np.concatenate([rows_of(back), twist], axis=-1))
+
+
+def _algebra(twist: FloatArray) -> FloatArray:
+    """Twists (..., 6) as elements of se(3) (..., 4, 4)."""
+    out = np.zeros((*twist.shape[:-1], 4, 4))
+    out[..., :3, :3], out[..., :3, 3] = hat(twist[..., 3:]), twist[..., :3]
+    return out
 
 
 def span(images: Sequence[ImageTiming], p: Parameters) -> tuple[float, float]:
@@ -139,21 +171,21 @@ def span(images: Sequence[ImageTiming], p: Parameters) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class DepthSurface:
-    """A depth image that others are compared with, on the device: inverse depth (1/m, 0 missing) averaged over a
-    window, its slopes by normalised coordinates, how far averaging may have moved it (m), and z (m) of what the colour
-    camera can see of it, else 0. median_depth, bound: see `Scaling`.
+    """A depth image that others are compared with: inverse depth (1/m, 0 missing) averaged over a window, its slopes by
+    normalised coordinates, how far averaging may have moved it (m), and z (m) of what the colour camera can see of it,
+    else 0; all (h, w). median_depth, bound: see `Scaling`.
     """
 
-    inverse_depth: Any
-    slope_x: Any
-    slope_y: Any
-    roughness: Any
-    shown_z: Any
+    inverse_depth: Float32Image
+    slope_x: Float32Image
+    slope_y: Float32Image
+    roughness: Float32Image
+    shown_z: Float32Image
     median_depth: float
     bound: float
 
 
-def surface_of(e: Engine, rho: Float32Image, fx: float, fy: float, baseline_m: float = 0.0) -> DepthSurface:
+def surface_of(rho: Float32Image, fx: float, fy: float, baseline_m: float = 0.0) -> DepthSurface:
     """Of `averaged` inverse depth (h, w).
 
     baseline_m: at most so far is the colour camera away, from where nearer things hide some of what is seen.
@@ -167,8 +199,56 @@ def surface_of(e: Engine, rho: Float32Image, fx: float, fy: float, baseline_m: f
     reach = max(1, math.ceil(baseline_m * fx * float(np.percentile(rho[rho > 0], 90.0)))) if (rho > 0).any() else 1
     nearest = np.asarray(cv2.dilate(rho, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)))
     shown = np.where((z > 0) & (nearest < np.float32(1.0 + _HIDES) * rho), z, np.float32(0.0))
-    on_device = e.upload(rho), e.upload(slope_x), e.upload(slope_y), e.upload(roughness), e.upload(shown)
-    return DepthSurface(*on_device, *depth_scaling(rho))
+    return DepthSurface(rho, slope_x, slope_y, roughness, shown, *depth_scaling(rho))
+
+
+@dataclass(frozen=True)
+class WindowImages:
+    """Images of a window's views, on the device.
+
+    z, shown_z (views, points): m, of the pixels that are compared, 0 missing. inverse_depth, slope_*, roughness:
+    atlases of `DepthSurface`; levels: atlases of intensities, NaN where they are unusable or there is no image.
+    median_depth (views,): m. bounds: of depth and of colour, see `Scaling`.
+    """
+
+    z: Any
+    shown_z: Any
+    inverse_depth: Any
+    slope_x: Any
+    slope_y: Any
+    roughness: Any
+    levels: tuple[Any, ...]
+    median_depth: FloatArray
+    bounds: tuple[float, float]
+
+
+def window_images(
+    e: Engine, surfaces: Sequence[DepthSurface], colors: Sequence[Sequence[Float32Image]], bound: float, stride: int
+) -> WindowImages:
+    """From views' surfaces and their pyramids of intensities, empty where there is no image; bound: of colour."""
+    rho = np.stack([surface.inverse_depth[::stride, ::stride] for surface in surfaces])
+    z = np.divide(np.float32(1.0), rho, out=np.zeros_like(rho), where=rho > 0.0)
+    shown = np.stack([surface.shown_z[::stride, ::stride] for surface in surfaces])
+    names = "inverse_depth", "slope_x", "slope_y", "roughness"
+    planes = {name: e.upload(_atlas([getattr(surface, name) for surface in surfaces])) for name in names}
+    some = next(levels for levels in colors if levels)
+    none = [np.full_like(level, np.nan) for level in some]
+    levels = tuple(e.upload(_atlas(level)) for level in zip(*(each or none for each in colors), strict=True))
+    depths, bounds = np.array([(surface.median_depth, surface.bound) for surface in surfaces]).T
+    points = e.upload(z), e.upload(shown)
+    return WindowImages(*points, **planes, levels=levels, median_depth=depths, bounds=(float(bounds.max()), bound))
+
+
+def _atlas(images: Sequence[Float32Image]) -> Float32Image:
+    """Images (h, w) side by side: a kernel that looks into any of them is handed one array."""
+    height, width = images[0].shape
+    if len(images) > ACROSS**2:
+        raise ValueError(f"{len(images)} images do not fit into an atlas of {ACROSS} by {ACROSS}")
+    out = np.zeros((-(-len(images) // ACROSS) * height, ACROSS * width), np.float32)
+    for k, image in enumerate(images):
+        x, y = width * (k % ACROSS), height * (k // ACROSS)
+        out[y : y + height, x : x + width] = image
+    return out
 
 
 def averaged(rho: Float32Image) -> Float32Image:

@@ -11,7 +11,7 @@ moves a point in either camera (`optics.moves`); depth's own error by depth alon
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -22,49 +22,92 @@ from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, 
 from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
-from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
+from rstrack.calibration.pairs.images import ACROSS
+from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, wider, without_error
 from rstrack.images.sampling import cubic_value_and_slope, level_size, surface
 
 
 @dataclass(frozen=True)
 class DepthPairInput(GeometricInput):
-    """Device arrays of the depth kernel: see `GeometricInput`; camera: `camera_table`; error: `error_table`."""
+    """Device arrays of the depth kernel, see `GeometricInput`, for all pairs of a launch.
 
+    depth, rays_*: of the pixels that are compared, of each view and of all. Surfaces are atlases. to_base, from_base:
+    of all views' lines. launch: the launch's first pair, and the last of all, which it repeats where there are no more.
+    pairs: current view and reference of each pair. own: of each pair the reference's 1 / median depth (1/m), and gain
+    and offset. camera: `camera_table`; error: `error_table`. constants: units of the unknowns too.
+    """
+
+    launch: Any
+    pairs: Any
+    own: Any
     camera: Any
     error: Any
 
 
 @dataclass(frozen=True)
 class ColorPairInput:
-    """Device arrays of the colour kernel.
+    """Device arrays of the colour kernel, likewise.
 
-    depth: z of the reference's depth image (m, 0: none); rays_*: its normalised coordinates; to_base: poses of its
-    lines; error: `error_table`. image, from_base: current intensities, NaN where they are unusable, and the colour
-    camera's lines; ref_*: the reference's; camera: `camera_table`. constants: those of `Scaling`, gain and offset of
-    the current image against the reference's, units of the unknown lens.
+    depth: z of what the colour camera sees of each view's depth (m, 0: none); to_base: poses of depth's lines. image:
+    atlas of intensities, NaN where they are unusable; from_base: the colour camera's lines; camera: its `camera_table`.
+    own: gain and offset of the current image against the reference's last.
     """
 
     depth: Any
     rays_x: Any
     rays_y: Any
     to_base: Any
-    error: Any
     image: Any
     from_base: Any
-    ref_image: Any
-    ref_from_base: Any
+    launch: Any
+    pairs: Any
+    own: Any
     camera: Any
+    error: Any
     constants: Any
+
+
+Given = DepthPairInput | ColorPairInput
+
+
+@dataclass(frozen=True)
+class PairGrid:
+    """Pixels of depth images that are compared: number of the pair, in the launch and of all, its current view and its
+    reference, number among the pixels of an image, x, y, and which are meant."""
+
+    launched: Any
+    pair: Any
+    current: Any
+    reference: Any
+    number: Any
+    x: Any
+    y: Any
+    meant: Any
+
+
+def pair_grid(e: Engine, lens: Lens, stride: int, pixels: PixelGrid, given: Given) -> PairGrid:
+    """From pixels of images that stand below each other, or beside each other, in order of the pairs."""
+    camera = lens.camera
+    columns, rows = -(-camera.width // stride), -(-camera.height // stride)
+    column, row = pixels.x // stride, pixels.y // stride
+    if lens.shutter.by_rows:
+        launched, row = row // rows, row % rows
+    else:
+        launched, column = column // columns, column % columns
+    first, last = (dr.gather(e.UInt, given.launch, e.UInt(i)) for i in range(2))
+    pair = dr.minimum(first + launched, last)
+    current, reference = (dr.gather(e.UInt, given.pairs, 2 * pair + i) for i in range(2))
+    return PairGrid(
+        launched, pair, current, reference, row * columns + column, column * stride, row * stride, pixels.meant
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Point:
-    """Pixels' points, on the device: index, line and row of the pixels, ray, z (m; without its error), the point in the
-    depth camera's frame (q) and in the base's (p), T_base_cam, and which there are."""
+    """Pixels' points, on the device: line of the pixels, ray, z (m; without its error), the point in the depth camera's
+    frame (q) and in the base's (p), T_base_cam, and which there are."""
 
-    pixel: Any
     line: Any
-    row: Any
     xn: Any
     yn: Any
     z: Any
@@ -74,16 +117,28 @@ class Point:
     active: Any
 
 
-def _points(e: Engine, depth: Lens, pixels: PixelGrid, asked: Asked, given: DepthPairInput | ColorPairInput) -> Point:
-    """Of pixels of a depth image."""
-    images = given.depth, given.rays_x, given.rays_y
-    z, xn, yn = (dr.gather(e.Float, image, pixels.index) for image in images)
+def _points(e: Engine, depth: Lens, stride: int, pixels: PairGrid, view: Any, asked: Asked, given: Given) -> Point:
+    """Of pixels of a view's depth image."""
+    camera = depth.camera
+    points = -(-camera.width // stride) * -(-camera.height // stride)
+    z = dr.gather(e.Float, given.depth, view * points + pixels.number)
+    xn, yn = (dr.gather(e.Float, rays, pixels.number) for rays in (given.rays_x, given.rays_y))
     active = pixels.meant & (z > 0.0)
     z = without_error(e, asked, z, xn, yn, given.error)
     q = xn * z, yn * z, z
     line = e.UInt(depth.line_of(e.Int(pixels.x), e.Int(pixels.y)))
-    T_base_cam = gather(given.to_base, line, TO_BASE, stride=TO_BASE)
-    return Point(pixels.index, line, pixels.y, xn, yn, z, q, move(T_base_cam, q), T_base_cam, active)
+    T_base_cam = gather(given.to_base, view * depth.lines + line, TO_BASE, stride=TO_BASE)
+    return Point(line, xn, yn, z, q, move(T_base_cam, q), T_base_cam, active)
+
+
+def in_atlas(view: Any, width: int, height: int, x: Any, y: Any) -> tuple[Any, Any]:
+    """Where pixels (x, y) of a view's image are in an atlas of images of that size."""
+    return x + type(x)(view % ACROSS * width), y + type(y)(view // ACROSS * height)
+
+
+def _inside(width: int, height: int, margin: float, x: Any, y: Any) -> Any:
+    """Whether all that is interpolated between lies in one image, and not in the atlas's next."""
+    return (x >= margin) & (y >= margin) & (x < width - 1.0 - margin) & (y < height - 1.0 - margin)
 
 
 @dataclass(frozen=True)
@@ -103,16 +158,24 @@ class DepthResidual:
     is_smooth: Any
 
 
-def depth_residual(e: Engine, depth: Lens, pixels: PixelGrid, asked: Asked, given: DepthPairInput) -> DepthResidual:
+def depth_residual(
+    e: Engine, depth: Lens, stride: int, pixels: PairGrid, asked: Asked, given: DepthPairInput
+) -> DepthResidual:
     """Equation (6) with rows' times on both sides."""
     lens = traced(e, depth, given.camera)
-    at = _points(e, depth, pixels, asked, given)
-    seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int)
-    rho, active = surface(e, lens.camera, given.inverse_depth, seen.x, seen.y, at.active & seen.valid)
+    width, height = depth.camera.width, depth.camera.height
+    at = _points(e, depth, stride, pixels, pixels.current, asked, given)
+    first = pixels.reference * depth.lines
+    seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, first)
+    active = at.active & seen.valid & _inside(width, height, 0.0, seen.x, seen.y)
+    x, y = in_atlas(pixels.reference, width, height, seen.x, seen.y)
+    atlas = wider(lens.camera, ACROSS)
+    rho, active = surface(e, atlas, given.inverse_depth, x, y, active)
     if asked.corrects:
         rho = dr.rcp(without_error(e, asked, dr.rcp(rho), seen.at.xn, seen.at.yn, given.error))
-    even = evened(at.z, dr.gather(e.Float, given.constants, e.UInt(2)))
-    r, g, is_smooth = plane_distance(e, given, lens.camera, seen, rho, active, even)
+    even = evened(at.z, dr.gather(e.Float, given.own, 3 * pixels.pair))
+    there = replace(seen, x=x, y=y)
+    r, g, is_smooth = plane_distance(e, given, atlas, there, rho, active, even)
     return DepthResidual(at, lens, seen, r, g, even, active, is_smooth)
 
 
@@ -138,87 +201,99 @@ class ColorResidual:
 
 
 def color_residual(
-    e: Engine, color: Lens, depth: Lens, pixels: PixelGrid, level: int, asked: Asked, given: ColorPairInput
+    e: Engine, color: Lens, depth: Lens, stride: int, pixels: PairGrid, level: int, asked: Asked, given: ColorPairInput
 ) -> ColorResidual:
     """Intensities of the level, the reference's with the gain and offset that the current image has."""
     width, height = level_size(color.camera.width, level), level_size(color.camera.height, level)
     shrink = 0.5**level
 
-    def looked_up(image: Any, seen: RollingProjection, active: Any) -> tuple[Any, Vector, Any]:
+    def looked_up(view: Any, active: Any) -> tuple[RollingProjection, Any, Vector, Any]:
+        seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, view * color.lines)
         x, y = seen.x * shrink, seen.y * shrink
-        value, dx, dy, active = cubic_value_and_slope(e, image, width, height, x, y, active & seen.valid)
-        return value, seen.chain(dx * shrink, dy * shrink, 0.0), active
+        active = active & seen.valid & _inside(width, height, 1.0, x, y)
+        x, y = in_atlas(view, width, height, x, y)
+        # As high as any: where the image ends has been looked at.
+        value, dx, dy, active = cubic_value_and_slope(e, given.image, ACROSS * width, ACROSS * height, x, y, active)
+        return seen, value, seen.chain(dx * shrink, dy * shrink, 0.0), active
 
     lens = traced(e, color, given.camera)
-    at = _points(e, depth, pixels, asked, given)
-    here = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int)
-    there = project_rolling(lens, given.ref_from_base, at.p, e.UInt, e.Int)
-    value, own, active = looked_up(given.image, here, at.active)
-    ref, other, active = looked_up(given.ref_image, there, active)
-    gain, offset = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
+    at = _points(e, depth, stride, pixels, pixels.reference, asked, given)
+    here, value, own, active = looked_up(pixels.current, at.active)
+    there, ref, other, active = looked_up(pixels.reference, active)
+    gain, offset = (dr.gather(e.Float, given.own, 3 * pixels.pair + i) for i in (1, 2))
     contrast = ref - MID_GREY
     r = value - (ref + dr.fma(gain, contrast, offset))
     return ColorResidual(lens, at.p, here, there, r, own, other, gain, contrast, active)
 
 
-def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked) -> Callable[[DepthPairInput], Any]:
-    """Kernel of the depth term: sums over pairs of blocks (current, reference) of depth lines."""
+def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: int) -> Callable[[DepthPairInput], Any]:
+    """Kernel of the depth term: for each pair the sums over pairs of blocks (current, reference) of depth lines."""
     names = asked.depth
+    of = sizes(depth, depth, len(names))
 
     @recorded_from(DepthPairInput)
     def kernel(given: DepthPairInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
-            of = depth_residual(e, depth, pixels, asked, given)
-            point, seen, columns = of.at, of.seen, []
+            grid = pair_grid(e, depth, stride, pixels, given)
+            of_pixel = depth_residual(e, depth, stride, grid, asked, given)
+            point, seen, columns = of_pixel.at, of_pixel.seen, []
             if names:
-                own = project(of.lens.camera, point.q), seen.at
-                here, there = (moves(names, of.lens.camera, one) for one in own)
+                own = project(of_pixel.lens.camera, point.q), seen.at
+                here, there = (moves(names, of_pixel.lens.camera, one) for one in own)
                 shifts = zip(there, here, strict=True)
-                columns = unknown_columns(e, of.g, shifts, seen.M, point.T_base_cam, given.constants)
-            slot = block_slot(point.line, seen.row, depth, depth, point.row, len(names))
-            judged = of.is_smooth, len(names)
-            return contribution(e, of.g, point.p, 1.0, of.r, of.active, parameters, slot, columns, *judged)
+                columns = unknown_columns(e, of_pixel.g, shifts, seen.M, point.T_base_cam, given.constants)
+            slot = grid.launched * of[0] + block_slot(point.line, seen.row, depth, depth, grid.y, len(names))
+            judged = of_pixel.is_smooth, len(names)
+            motion = of_pixel.g, point.p, 1.0, of_pixel.r, of_pixel.active
+            return contribution(e, *motion, parameters, slot, columns, *judged)
 
-        return _summed(e, depth, depth, stride, len(names), at)
+        return _summed(e, depth, stride, pairs, of, at)
 
     return kernel
 
 
 def color_pair_kernel(
-    e: Engine, color: Lens, depth: Lens, stride: int, level: int, asked: Asked
+    e: Engine, color: Lens, depth: Lens, stride: int, level: int, asked: Asked, pairs: int
 ) -> Callable[[ColorPairInput], Any]:
-    """Kernel of the colour term: sums over pairs of blocks (current, reference) of *colour* lines.
+    """Kernel of the colour term: for each pair the sums over pairs of blocks (current, reference) of *colour* lines.
 
     Its further columns: what is asked of the colour camera's lens, then gain and offset of the current image.
     """
     names = asked.color
+    size = sizes(color, color, len(names) + 2)
 
     @recorded_from(ColorPairInput)
     def kernel(given: ColorPairInput) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
-            of = color_residual(e, color, depth, pixels, level, asked, given)
+            grid = pair_grid(e, depth, stride, pixels, given)
+            of = color_residual(e, color, depth, stride, grid, level, asked, given)
             here, there, columns = of.here, of.there, []
             a, b, c = (0.5 * dr.fma(1.0 + of.gain, two, one) for one, two in zip(of.own, of.other, strict=True))
             if names:
-                pairs = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
-                columns = unknown_columns(e, (a, b, c), pairs, here.M, turned_round(there.M), given.constants)
+                shifts = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
+                columns = unknown_columns(e, (a, b, c), shifts, here.M, turned_round(there.M), given.constants)
             columns += [-of.contrast, e.Float(-1.0)]
-            slot = block_slot(here.row, there.row, color, color, here.y, len(columns))
+            slot = grid.launched * size[0] + block_slot(here.row, there.row, color, color, here.y, len(columns))
             # A twist of the camera moves the point the other way.
             return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns, True, len(names))
 
-        return _summed(e, depth, color, stride, len(names) + 2, at)
+        return _summed(e, depth, stride, pairs, size, at)
 
     return kernel
 
 
 def _summed(
-    e: Engine, depth: Lens, lens: Lens, stride: int, columns: int, at: Callable[[PixelGrid], Contribution]
+    e: Engine, depth: Lens, stride: int, pairs: int, of: tuple[int, int], at: Callable[[PixelGrid], Contribution]
 ) -> Any:
-    """Sums over a depth image's pixels, in blocks of a lens's lines."""
-    shape = depth.camera.width, depth.camera.height, stride
-    return summed(e, shape, sizes(lens, lens, columns), at, not lens.shutter.by_rows, False)
+    """Sums over depth images' pixels, the images below each other if they are read by rows, else beside each other.
+
+    of: see `sizes`, of one pair.
+    """
+    width, height = (-(-size // stride) * stride for size in (depth.camera.width, depth.camera.height))
+    by_rows = depth.shutter.by_rows
+    shape = (width, height * pairs, stride) if by_rows else (width * pairs, height, stride)
+    return summed(e, shape, (of[0] * pairs, of[1]), at, not by_rows, False)

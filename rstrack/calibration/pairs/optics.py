@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -14,7 +15,6 @@ from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.device.projection import Projection, Vector
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import BlockSums, ColumnSums
 from rstrack.calibration.parameters import DEPTH, LENS, NAMES
 from rstrack.data.rig import DepthError
 
@@ -84,6 +84,13 @@ class _Traced(Camera):
         )  # fmt: skip
 
 
+def wider(camera: Camera, times: int) -> Camera:
+    """The traced camera as one of images so many times as wide and as high."""
+    found = copy(camera)
+    found.__dict__.update(width=times * camera.width, height=times * camera.height)
+    return found
+
+
 def without_error(e: Engine, asked: Asked, z: Any, xn: Any, yn: Any, table: Any) -> Any:
     """Depth on the device, along rays (xn, yn), as `DepthError.corrected` has it."""
     if not asked.corrects:
@@ -148,15 +155,6 @@ def turn(R: list[Any], v: Vector) -> Vector:
     """R v."""
     x, y, z = (R[3 * i] * v[0] + R[3 * i + 1] * v[1] + R[3 * i + 2] * v[2] for i in range(3))
     return x, y, z
-
-
-def in_units(sums: BlockSums, unit: FloatArray) -> BlockSums:
-    """The sums with further columns by the unknowns themselves, not by `unit` (n,) of them."""
-    own = sums.columns
-    if own is None:
-        return sums
-    own = ColumnSums(own.coupling * unit, own.H * np.outer(unit, unit), own.g * unit)
-    return replace(sums, columns=own)
 
 
 def units(names: Sequence[str], median_depth: float) -> FloatArray:

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
-from rsgen.array_types import BoolArray, FloatArray
-from rsgen.device.arrays import Engine, Kernels
+from rsgen.array_types import BoolArray, FloatArray, IntArray
+from rsgen.device.arrays import Engine, Kernels, aligned
 from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts
+from rstrack.alignment.block_sums import Scaling, block_counts, sizes
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
-from rstrack.calibration.pairs.images import DepthSurface, pair_lens
+from rstrack.calibration.pairs.chain import PairSums, pair_sums
+from rstrack.calibration.pairs.images import LinePoses, WindowImages, pair_lens
 from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, color_pair_kernel, depth_pair_kernel
-from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, in_units, units
+from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, units
 from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError
-from rstrack.images.line_poses import Exposure
-from rstrack.images.pyramid import camera_rays
 
 # Part of σ by which the averaging may have bent a pixel's surface.
 _SMOOTH = 0.25
@@ -47,11 +47,11 @@ class PairTerms:
         self._kernel = Kernels(self.e)
 
     def optics(self, p: Parameters) -> Optics:
-        """Rays, cameras and depth's error, on the device."""
+        """Rays of the pixels that are compared, cameras and depth's error, on the device."""
         now = *self.cameras(p), p.error
         if self._optics is None or self._optics[0] != now:
             e, (depth, color, error) = self.e, now
-            rays = camera_rays(Exposure(Lens(depth, self.depth.shutter), 0.0, np.eye(4)))
+            rays = np.nan_to_num(depth.unproject(depth.pixel_grid()[:: self.stride, :: self.stride])[..., :2])
             tables = camera_table(depth), camera_table(color), error_table(error)
             found = Optics(*(e.upload(given) for given in (rays[..., 0], rays[..., 1], *tables)))
             self._optics = now, found
@@ -63,75 +63,93 @@ class PairTerms:
         return changed(self.depth.camera, depth), changed(self.color.camera, p.color_lens)
 
     def by_depth(
-        self,
-        z: Any,
-        surface: DepthSurface,
-        to_base: FloatArray,
-        ref_from_base: FloatArray,
-        optics: Optics,
-        sigma: float,
-    ) -> Callable[[], BlockSums]:
-        """A depth image's z against a surface; σ in m. The device works until what this returns is called."""
-        asked, stride, bound = self.asked, self.stride, surface.bound
-        scaling = self._scaling(surface.median_depth, bound, stride, self.depth)
-        given = self.depth_input(z, surface, to_base, ref_from_base, optics, sigma, scaling)
-        raw = self._kernel(depth_pair_kernel, self.depth, stride, asked)(given)
-        current, reference, _, _ = block_counts(self.depth, self.depth)
-        unit = units(asked.depth, surface.median_depth) * bound
-        return lambda: in_units(scaling.unpack(raw.numpy(), current, reference, len(unit)), unit)
+        self, images: WindowImages, pairs: IntArray, lines: LinePoses, optics: Optics, sigma: float, lever: float
+    ) -> Callable[[], PairSums]:
+        """Depth images against surfaces, of pairs (n, 2): current view and reference.
+
+        sigma: m; lever: m, see `Scaling`. The device works until what this returns is called.
+        """
+        scaling = self._scaling(lever, images.bounds[0], self.depth)
+        unit = units(self.asked.depth, lever) * scaling.bound
+        given = self.depth_input(images, pairs, lines, optics, sigma, scaling)
+        what = depth_pair_kernel, self.depth, self.stride, self.asked
+        return self._in_launches(given, what, pairs, scaling, self.depth, unit)
 
     def by_color(
-        self, images: tuple[Any, Any], surface: DepthSurface, to_base: FloatArray, from_base: FloatArray,
-        ref_from_base: FloatArray, optics: Optics, bound: float, brightness: FloatArray, sigma: float, level: int,
-    ) -> Callable[[], BlockSums]:  # fmt: skip
-        """A colour image against the reference's, both given as intensities of a level.
+        self, images: WindowImages, level: int, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
+        brightness: FloatArray, sigma: float, lever: float,
+    ) -> Callable[[], PairSums]:  # fmt: skip
+        """Colour images of a level against the references', likewise.
 
-        bound: see `Scaling`, from the reference's gradients. brightness (2,): gain and offset; σ: of intensities.
+        lines: of depth images and of colour images, the latter by view too. brightness (views, views, 2): gain and
+        offset of each against each. sigma: of intensities.
         """
-        asked, stride = self.asked, self.stride
-        scaling = self._scaling(surface.median_depth, bound, stride, self.color)
-        lines = to_base, from_base, ref_from_base
-        given = self.color_input(images, surface, lines, optics, brightness, sigma, scaling)
-        raw = self._kernel(color_pair_kernel, self.color, self.depth, stride, level, asked)(given)
-        current, reference, _, _ = block_counts(self.color, self.color)
-        unit = np.concatenate([units(asked.color, surface.median_depth) * bound, np.ones(2)])
-        return lambda: in_units(scaling.unpack(raw.numpy(), current, reference, len(unit)), unit)
+        scaling = self._scaling(lever, images.bounds[1], self.color)
+        unit = np.concatenate([units(self.asked.color, lever) * scaling.bound, np.ones(2)])
+        given = self.color_input(images, level, pairs, lines, optics, brightness, sigma, scaling)
+        what = color_pair_kernel, self.color, self.depth, self.stride, level, self.asked
+        return self._in_launches(given, what, pairs, scaling, self.color, unit)
 
     def depth_input(
-        self, z: Any, surface: DepthSurface, to_base: FloatArray, ref_from_base: FloatArray, optics: Optics,
-        sigma: float, scaling: Scaling,
-    ) -> DepthPairInput:  # fmt: skip
+        self, images: WindowImages, pairs: IntArray, lines: LinePoses, optics: Optics, sigma: float, scaling: Scaling
+    ) -> DepthPairInput:
         """What the depth kernel takes; see `by_depth`."""
         gate = max(GATE_SIGMAS * sigma, 10.0 * FLOOR_DEPTH)
-        unit = units(self.asked.depth, surface.median_depth)
+        unit = units(self.asked.depth, scaling.median_depth)
         constants = np.concatenate([scaling.parameters(sigma, gate), [_SMOOTH * sigma, 0.0], unit])
-        to, of = self.e.upload(to_base), self.e.upload(ref_from_base)
-        ref = surface.inverse_depth, surface.slope_x, surface.slope_y, surface.roughness
-        own = self.e.upload(constants), optics.depth_camera, optics.error
-        return DepthPairInput(z, optics.rays_x, optics.rays_y, to, *ref, of, *own)
+        tables = self.e.upload(lines.to_base), self.e.upload(lines.from_base)
+        surfaces = images.inverse_depth, images.slope_x, images.slope_y, images.roughness
+        geometric = images.z, optics.rays_x, optics.rays_y, tables[0], *surfaces, tables[1]
+        of_pairs = self._of_pairs(images, pairs, np.zeros((len(pairs), 2)))
+        return DepthPairInput(*geometric, self.e.upload(constants), *of_pairs, optics.depth_camera, optics.error)
 
     def color_input(
-        self, images: tuple[Any, Any], surface: DepthSurface, lines: tuple[FloatArray, FloatArray, FloatArray],
-        optics: Optics, brightness: FloatArray, sigma: float, scaling: Scaling,
+        self, images: WindowImages, level: int, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
+        brightness: FloatArray, sigma: float, scaling: Scaling,
     ) -> ColorPairInput:  # fmt: skip
-        """What the colour kernel takes; see `by_color`. lines: to_base, from_base, ref_from_base."""
-        unit = units(self.asked.color, surface.median_depth)
-        constants = np.concatenate([scaling.parameters(sigma, GATE_INTENSITY), brightness, unit])
-        to, own, other = (self.e.upload(table) for table in lines)
-        points = surface.shown_z, optics.rays_x, optics.rays_y, to, optics.error
-        seen = images[0], own, images[1], other, optics.color_camera
-        return ColorPairInput(*points, *seen, self.e.upload(constants))
+        """What the colour kernel takes; see `by_color`."""
+        unit = units(self.asked.color, scaling.median_depth)
+        constants = np.concatenate([scaling.parameters(sigma, GATE_INTENSITY), [0.0, 0.0], unit])
+        points = images.shown_z, optics.rays_x, optics.rays_y, self.e.upload(lines[0].to_base)
+        seen = images.levels[level], self.e.upload(lines[1].from_base)
+        of_pairs = self._of_pairs(images, pairs, brightness[pairs[:, 0], pairs[:, 1]])
+        return ColorPairInput(*points, *seen, *of_pairs, optics.color_camera, optics.error, self.e.upload(constants))
+
+    def _of_pairs(self, images: WindowImages, pairs: IntArray, brightness: FloatArray) -> tuple[Any, Any, Any]:
+        """`launch`, of all, `pairs` and `own` of the inputs."""
+        own = np.column_stack([1.0 / images.median_depth[pairs[:, 1]], brightness])
+        whole = self.e.UInt(aligned([0, len(pairs) - 1], np.uint32))
+        return whole, self.e.UInt(aligned(pairs, np.uint32)), self.e.upload(own)
+
+    def _in_launches(
+        self, given: DepthPairInput | ColorPairInput, what: tuple[Any, ...], pairs: IntArray, scaling: Scaling,
+        lens: Lens, unit: FloatArray,
+    ) -> Callable[[], PairSums]:  # fmt: skip
+        """The sums of all pairs, by launches of as many as Dr.Jit may keep sums of for each thread."""
+        size = sizes(lens, lens, len(unit))[0]
+        count = -(-len(pairs) * size // dr.expand_threshold())
+        each = -(-len(pairs) // count)
+        kernel = self._kernel(*what, each)
+        launches = (aligned([k * each, len(pairs) - 1], np.uint32) for k in range(count))
+        raw = [kernel(replace(given, launch=self.e.UInt(launch))) for launch in launches]
+
+        def found() -> PairSums:
+            whole = np.concatenate([one.numpy() for one in raw])[: len(pairs) * size]
+            apart = what[0] is color_pair_kernel
+            return pair_sums(whole, scaling, pairs, block_counts(lens, lens)[0], unit, apart)
+
+        return found
 
     @property
     def stride(self) -> int:
         """Of the pixels of depth images that count."""
         return max(1, math.isqrt(self.depth.camera.width * self.depth.camera.height // _POINTS))
 
-    def _scaling(self, median_depth: float, bound: float, stride: int, lens: Lens) -> Scaling:
+    def _scaling(self, lever: float, bound: float, lens: Lens) -> Scaling:
         camera = self.depth.camera
-        pixels = -(-camera.width // stride) * -(-camera.height // stride)
+        pixels = -(-camera.width // self.stride) * -(-camera.height // self.stride)
         blocks = block_counts(lens, lens)[0]
-        return Scaling(median_depth, bound, min(pixels, -(-_CROWDED * pixels // blocks)))
+        return Scaling(lever, bound, min(pixels, -(-_CROWDED * pixels // blocks)))
 
 
 def pair_terms(e: Engine, dataset: Dataset, free: BoolArray | None = None) -> PairTerms:

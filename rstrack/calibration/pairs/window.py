@@ -2,48 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.block_sums import BlockSums
-from rstrack.alignment.brightness import SAME
 from rstrack.alignment.normal_equations import Eliminated, eliminate
 from rstrack.alignment.priors import ACCELERATION, acceleration_prior, acceleration_sigmas, pose_constraint
 from rstrack.alignment.weights import FLOOR_DEPTH, FLOOR_INTENSITY, START_DEPTH, START_INTENSITY, scale_step
-from rstrack.calibration.pairs.images import DepthSurface, ImageTiming, LinePoses, lines_of
-from rstrack.calibration.pairs.optics import Optics
+from rstrack.calibration.pairs.chain import add_system, without_brightness
+from rstrack.calibration.pairs.images import ImageTiming, WindowImages, lines_of
 from rstrack.calibration.pairs.terms import PairTerms
-from rstrack.calibration.parameters import COUNT, POSES, Parameters
+from rstrack.calibration.parameters import COUNT, Parameters
 
 # σ of accelerations (m/s², rad/s²), looser than the tracker's.
 _ACCELERATION = 3.0 * ACCELERATION
 _GAUGE = np.full(6, 1e-6)
 # Frames between those that are compared: near ones determine the clocks, far ones the extrinsics.
 _APART = (1, 4, 9, 16)
-# σ of gain and offset of an image against another, and the least and the most that they become.
-_BRIGHTNESS, _BRIGHTNESS_BOUNDS = np.array([0.3, 0.15]), (-0.7, 2.0)
 
 
-@dataclass
+@dataclass(frozen=True)
 class WindowFrame:
-    """A frame on the device: its depth, as z (m) and as a surface, and the colour image that goes with it, if any.
-
-    levels: intensities of the pyramid's levels, NaN where they are unusable. bound: see `intensity_bound`.
-    """
+    """When a frame's depth was taken, and the colour image that goes with it, if it has one."""
 
     depth: ImageTiming
-    z: object
-    surface: DepthSurface
-    color: ImageTiming | None = None
-    levels: tuple[object, ...] = ()
-    bound: float = 1.0
+    color: ImageTiming
+    has_color: bool
 
 
 @dataclass(frozen=True)
@@ -74,16 +63,17 @@ class WindowSums:
 
 @dataclass
 class RecordingWindow:
-    """Views in order of time, and the spline T_world_depth(t) that covers them all.
+    """Views in order of time, their images, and the spline T_world_depth(t) that covers them all.
 
-    sigma: of depth (m) and of intensity. brightness: gain and offset of each pair (view, reference). is_rough: every
-    second distance between views is enough.
+    sigma: of depth (m) and of intensity. brightness (views, views, 2): gain and offset of each view against each
+    reference. is_rough: every second distance between views is enough.
     """
 
     views: list[WindowFrame]
+    images: WindowImages
     spline: Spline
+    brightness: FloatArray
     sigma: tuple[float, float] = (START_DEPTH, START_INTENSITY)
-    brightness: dict[tuple[int, int], FloatArray] = field(default_factory=dict)
     is_rough: bool = False
 
     @property
@@ -97,84 +87,57 @@ class RecordingWindow:
         depth_counts: part of depth's pixels that count, as the others only repeat them.
         """
         size = 6 * len(self.spline.control_points) + COUNT
-        H, g = np.zeros((size, size)), np.zeros(size)
-        optics = terms.optics(p)
-        depths = lines_of([view.depth for view in self.views], self.spline, p)
-        seen = iter(lines_of([view.color for view in self.views if view.color is not None], self.spline, p))
-        colors = [None if view.color is None else next(seen) for view in self.views]
-        weighted, counted, cost = np.zeros(2), np.zeros(2, int), 0.0
-        by_depth = np.zeros_like(H), np.zeros_like(g)
-        for kind, pair, sums, current, reference, T_base_world in self._pairs(terms, optics, p, level, depths, colors):
-            sigma = self.sigma[kind]
-            own, own_g = _system(sums, current, reference, T_base_world, sigma)
-            counts = 1.0
+        base, lever = self.base(p)
+        optics, pairs = terms.optics(p), partners(len(self.views), _APART[::2] if self.is_rough else _APART)
+        depths = lines_of([view.depth for view in self.views], self.spline, p, base)
+        started = [terms.by_depth(self.images, pairs, depths, optics, self.sigma[0], lever)]
+        colors = lines_of([view.color for view in self.views], self.spline, p, base)
+        lines = depths, colors
+        has_color = np.array([view.has_color for view in self.views])
+        seen = pairs[has_color[pairs].all(axis=1)]
+        if len(seen):
+            given = self.images, level, seen, lines, optics, self.brightness
+            started.append(terms.by_color(*given, self.sigma[1], lever))
+        H, g, cost, found = np.zeros((size, size)), np.zeros(size), 0.0, list(self.sigma)
+        sums = [sums_of() for sums_of in started]
+        for kind, one in enumerate(sums):
+            sigma, floor = self.sigma[kind], (FLOOR_DEPTH, FLOOR_INTENSITY)[kind]
+            rest = add_system(H, g, one, lines[kind], terms.asked.at[kind], sigma)
             if kind:
-                own, own_g = self._without_brightness(pair, own, own_g)
-            elif depth_counts < 1.0:
-                counts = depth_counts
-                _add(*by_depth, own, own_g, current, reference, terms.asked.at[kind])
-                own, own_g = counts * own, counts * own_g
-            _add(H, g, own, own_g, current, reference, terms.asked.at[kind])
-            weighted[kind] += sums.weighted
-            counted[kind] += sums.count
-            cost += counts * (sums.cost + sums.count * np.log(sigma))
+                at = seen[:, 0], seen[:, 1]
+                self.brightness[at] = without_brightness(H, g, *rest, self.brightness[at])
+            else:
+                by_depth_alone = H.copy(), g.copy()
+                H *= depth_counts
+                g *= depth_counts
+            cost += (1.0 if kind else depth_counts) * (one.blocks.cost + one.blocks.count * np.log(sigma))
+            found[kind] = scale_step(sigma, one.blocks.weighted, one.blocks.count, floor)
         self._add_priors(H, g, p)
-        floors = FLOOR_DEPTH, FLOOR_INTENSITY
-        found = [scale_step(self.sigma[k], weighted[k], int(counted[k]), floors[k]) for k in range(2)]
         self.sigma = found[0], found[1]
-        return WindowSums(H, g, cost, int(counted.sum()), overcounted(*by_depth, H) if depth_counts < 1.0 else 1.0)
+        repeated = overcounted(*by_depth_alone, H) if depth_counts < 1.0 else 1.0
+        return WindowSums(H, g, cost, sum(one.blocks.count for one in sums), repeated)
+
+    def base(self, p: Parameters) -> tuple[FloatArray, float]:
+        """T_base_world of the frame that all is compared in, that of the view in the middle, and how far (m) what any
+        view sees is from there, about."""
+        T_base_world = se3.inverse(self.spline.pose(self.views[len(self.views) // 2].depth.mid_time(p)))
+        t = np.clip([view.depth.mid_time(p) for view in self.views], self.spline.t_begin, self.spline.t_end)
+        away = np.linalg.norm((T_base_world @ self.spline.pose(t))[:, :3, 3], axis=1)
+        return T_base_world, float((away + self.images.median_depth).max())
 
     def read_by(self, terms: PairTerms) -> RecordingWindow:
         """The same images and spline, to be changed by themselves, if cameras read their lines as those of `terms`."""
 
-        def taken(one: ImageTiming) -> ImageTiming:
-            return replace(one, lens=terms.depth if one.is_depth else terms.color)
+        def read(view: WindowFrame) -> WindowFrame:
+            depth, color = replace(view.depth, lens=terms.depth), replace(view.color, lens=terms.color)
+            return replace(view, depth=depth, color=color)
 
-        views = [replace(v, depth=taken(v.depth), color=v.color and taken(v.color)) for v in self.views]
-        return replace(self, views=views, brightness=dict(self.brightness))
+        return replace(self, views=[read(view) for view in self.views], brightness=self.brightness.copy())
 
     def move(self, increments: FloatArray) -> None:
         """T_i ← exp(δ_i) T_i for increments (k, 6) of all control points."""
         points = se3.orthonormalise(se3.exp(increments) @ self.spline.control_points)
         self.spline = Spline(points, self.spline.t0, self.spline.dt)
-
-    def _pairs(
-        self, terms: PairTerms, optics: Optics, p: Parameters, level: int, depths: Sequence[LinePoses],
-        colors: Sequence[LinePoses | None],
-    ) -> Iterator[tuple[int, tuple[int, int], BlockSums, LinePoses, LinePoses, FloatArray]]:  # fmt: skip
-        """Kind (0 depth, 1 colour), pair, sums, lines of the current image and the reference's, T_base_world."""
-        waiting = []
-        for r, others in enumerate(partners(len(self.views), _APART[::2] if self.is_rough else _APART)):
-            ref, surface = self.views[r], self.views[r].surface
-            T_base_world = se3.inverse(self.spline.pose(ref.depth.mid_time(p)))
-            ref_to_base, ref_from_base = depths[r].to_base(T_base_world), depths[r].from_base(T_base_world)
-            ref_color = colors[r]
-            color_from_base = None if ref_color is None else ref_color.from_base(T_base_world)
-            for k in others:
-                view = self.views[k]
-                to_base = depths[k].to_base(T_base_world)
-                started = terms.by_depth(view.z, surface, to_base, ref_from_base, optics, self.sigma[0])
-                waiting.append((0, (k, r), started, depths[k], depths[r], T_base_world))
-                color = colors[k]
-                if color is None or ref_color is None or color_from_base is None:
-                    continue
-                started = terms.by_color(
-                    (view.levels[level], ref.levels[level]), surface, ref_to_base, color.from_base(T_base_world),
-                    color_from_base, optics, ref.bound, self.brightness.get((k, r), SAME), self.sigma[1], level,
-                )  # fmt: skip
-                waiting.append((1, (k, r), started, color, ref_color, T_base_world))
-            # A few at a time: the device works ahead while their sums are chained.
-            for kind, pair, started, current, reference, T in waiting:
-                yield kind, pair, started(), current, reference, T
-            waiting.clear()
-
-    def _without_brightness(self, pair: tuple[int, int], H: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The system (m + 2, m + 2) without the last two unknowns, this pair's gain and offset: they take their next
-        values."""
-        at = self.brightness.get(pair, SAME)
-        found = eliminate(H[:-2, :-2], g[:-2], H[:-2, -2:], H[-2:, -2:], g[-2:], _BRIGHTNESS, at)
-        self.brightness[pair] = np.clip(at + found.step, *_BRIGHTNESS_BOUNDS)
-        return found.H, found.g
 
     def _add_priors(self, H: FloatArray, g: FloatArray, p: Parameters) -> None:
         count = len(self.spline.control_points)
@@ -202,61 +165,14 @@ def overcounted(H: FloatArray, g: FloatArray, information: FloatArray) -> float:
     return (float(g[:x] @ inverse @ g[:x]) - off) / max(1.0, float(np.trace(inverse @ own)))
 
 
-def partners(count: int, distances: Sequence[int]) -> list[list[int]]:
-    """For each of `count` views as a reference the views that are compared with it, so many frames apart.
+def partners(count: int, distances: Sequence[int]) -> IntArray:
+    """Pairs (n, 2) of `count` views, a view and the reference that it is compared with, so many frames apart.
 
     Every view is a reference as often as any other: the noise of a few would be in all that is compared with them. Of a
     pair the earlier and the later one take turns.
     """
-    found: list[list[int]] = [[] for _ in range(count)]
-    for n, apart in enumerate(distances):
-        for k in range(count - apart):
-            a, b = (k, k + apart) if (k + n) % 2 else (k + apart, k)
-            found[a].append(b)
-    return found
-
-
-def _system(
-    sums: BlockSums, current: LinePoses, reference: LinePoses, T_base_world: FloatArray, sigma: float
-) -> tuple[FloatArray, FloatArray]:
-    """A pair's H and g by control points of the current image, of the reference, the parameters that move poses, those
-    of lenses and depth that are asked for, and gain and offset, if any."""
-    J, used = _slopes(sums, current, reference, T_base_world)
-    flat = J.reshape(-1, J.shape[2])
-    H = flat.T @ (sums.H[used] @ J).reshape(-1, J.shape[2]) / sigma**2
-    g = flat.T @ sums.g[used].ravel() / sigma
-    own = sums.columns
-    if own is None:
-        return H, g
-    coupling = flat.T @ own.coupling[used].reshape(len(flat), len(own.g)) / sigma**2
-    return np.block([[H, coupling], [coupling.T, own.H / sigma**2]]), np.concatenate([g, own.g / sigma])
-
-
-def _slopes(
-    sums: BlockSums, current: LinePoses, reference: LinePoses, T_base_world: FloatArray
-) -> tuple[FloatArray, tuple[npt.NDArray[np.intp], ...]]:
-    """Derivatives (n, 6, m) of the relative twists of those pairs of blocks that have pixels, and these pairs.
-
-    m: control points of the current image, of the reference, parameters.
-    """
-    used = np.nonzero(np.abs(sums.H).sum(axis=(2, 3)))
-    Ad = se3.adjoint(T_base_world)
-    c, r = (Ad @ lines.by_points for lines in (current, reference))
-    q = Ad @ current.by_parameters, Ad @ reference.by_parameters
-    return np.concatenate([c[used[0]], -r[used[1]], q[0][used[0]] - q[1][used[1]]], axis=2), used
-
-
-def _add(
-    H: FloatArray, g: FloatArray, own: FloatArray, own_g: FloatArray, current: LinePoses, reference: LinePoses,
-    asked: Sequence[int],
-) -> None:  # fmt: skip
-    """Add a pair's system, in the columns of `_system`, to that of all unknowns; asked: places of the last ones."""
-    a, b, points = current.by_points.shape[2], reference.by_points.shape[2], len(g) - COUNT
-    to = [np.arange(6 * current.first, 6 * current.first + a), np.arange(6 * reference.first, 6 * reference.first + b),
-          points + np.array([*range(POSES), *asked], int)]  # fmt: skip
-    of = [slice(0, a), slice(a, a + b), slice(a + b, len(own_g))]
-    # Images close in time share control points: part by part, since an index that occurs twice is added once only.
-    for i, rows in zip(to, of, strict=True):
-        g[i] += own_g[rows]
-        for j, columns in zip(to, of, strict=True):
-            H[np.ix_(i, j)] += own[rows, columns]
+    found = [
+        (k + apart, k) if (k + n) % 2 else (k, k + apart)
+        for n, apart in enumerate(distances) for k in range(count - apart)
+    ]  # fmt: skip
+    return np.array(found, int).reshape(-1, 2)
