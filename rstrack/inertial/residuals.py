@@ -18,8 +18,8 @@ from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.estimate import GRAVITY, SIZE, TURN, ImuEstimate
 from rstrack.inertial.factor import ImuFactor, motion
 
-# Readings within this part of the range's end are saturated, or may be.
-_SATURATED = 0.995
+SATURATED = 0.995
+"""Part of a sensor's range from which on a reading is saturated, or may be."""
 # An outlier stands out from between its neighbours by so many σ of the noise, and so many times as far as the four
 # around it differ: motion that sudden would show in these, too. A bus that drops a bit leaves such readings.
 _SIGMAS, _TIMES = 20.0, 3.0
@@ -38,7 +38,7 @@ class ImuReadings:
         """All of a recording; saturated readings, outliers, and those that are not numbers do not count."""
         gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
         values = np.concatenate([gyro, imu.accel], axis=1)
-        limits = [np.inf if r is None else _SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
+        limits = [np.inf if r is None else SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
         parts = zip((gyro, imu.accel), reading_sigmas(imu), strict=True)
         with np.errstate(invalid="ignore"):
             counts = np.isfinite(values) & (np.abs(values) < np.repeat(limits, 3))

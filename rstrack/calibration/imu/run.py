@@ -22,6 +22,7 @@ from rstrack.calibration.imu.solve import ImuData, solve
 from rstrack.calibration.start import TrackedSpline, tracked
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
+from rstrack.inertial.residuals import SATURATED
 from rstrack.options import Options
 
 # Seconds that must have been followed; at both ends nothing is taken, since the clock moves.
@@ -31,8 +32,6 @@ _BIAS_S = 5.0
 # The corrections' knots are as near each other as this many samples.
 _SAMPLES_A_KNOT = 1.6
 _MOST_PARTS = 8
-# Part of a sensor's range from which on a reading is saturated.
-_SATURATED = 0.999
 # Where it begins: both clocks may be this far apart, s, looked for on so fine a grid.
 _GRID_HZ, _FARTHEST_S = 200.0, 1.0
 # Turning about one axis alone does not determine the axes: least part of the second largest; and least correlation.
@@ -83,7 +82,7 @@ def calibrate_imu(dataset: Dataset, followed: TrackedSpline, progress: Progress 
     frame_times = dataset.stamps + 0.5 * dataset.rig.depth_shutter.readout_s
     frame_times = frame_times[(frame_times > first) & (frame_times < last)]
     noise, readings = imu.noise, np.concatenate([imu.gyro, imu.accel], axis=1)[inside]
-    limits = [np.inf if limit is None else _SATURATED * limit for limit in (noise.gyro_range, noise.accel_range)]
+    limits = [np.inf if limit is None else SATURATED * limit for limit in (noise.gyro_range, noise.accel_range)]
     data = ImuData(
         CorrectedTrack(followed.spline, min(max(parts, 1), _MOST_PARTS)), imu.t[inside], readings,
         np.abs(readings) < np.repeat(limits, 3), frame_times, noise, imu.rate_hz,
