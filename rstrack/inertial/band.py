@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import welch
 
 from rsgen.array_types import FloatArray
 from rstrack.alignment.priors import ACCELERATION
@@ -112,6 +111,8 @@ def _spectrum(
 
     t: even times to take it at. density: of the noise.
     """
+    from scipy.signal import welch  # a quarter of all that a run imports, which only an IMU needs
+
     told = (np.isfinite(values) & ~outliers(values, density * np.sqrt(rate_hz))).all(axis=1)
     even: FloatArray = np.stack([np.interp(t, at[told], axis[told]) for axis in values.T])
     length = min(len(t), max(8, round(_STRETCH_S * rate_hz)))

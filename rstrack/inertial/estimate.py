@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry import so3
@@ -35,7 +35,7 @@ WARMS = 2e-5, 5e-4
 # an attitude, below which the IMU is usable; and of gravity's direction, degrees, below which that is determined.
 _KNOWN_GYRO, _KNOWN_FORCE, _KNOWN_DEG = 5e-3, 0.15, 0.3
 # χ² of three numbers that chance exceeds once in 10⁵, and a turn, rad, that is worth saying.
-_BEYOND, _WORTH_SAYING = float(chi2.isf(1e-5, 3)), np.radians(0.1)
+_BEYOND, _WORTH_SAYING = float(chdtri(3, 1e-5)), np.radians(0.1)
 
 
 def bias_walk(noise: ImuNoise, seconds: npt.ArrayLike) -> FloatArray:

@@ -47,6 +47,8 @@ Note = Callable[[FloatArray, FloatArray], str]
 # Frames after which the note is made anew, at least, and the factor by which they have grown by then: it takes as long
 # as there are frames.
 _NOTE_EVERY, _NOTE_GROWTH = 30, 1.05
+# What there is to say before the first frame has been tracked.
+_FIRST_FRAMES = "loading kernels; a machine's first run compiles them, up to a minute"
 # Files that mark a folder as a data set, which a run folder's spline.npz must not overwrite.
 _DATASET_FILES = ("sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")
 
@@ -149,6 +151,8 @@ def feed(run: Run, progress: Progress, watch: Watch | None, note: Note | None) -
             frame, problems = next(images)
             done.waited.append(time.perf_counter() - asked)
             done.unreadable += [(k, problem) for problem in problems]
+            if k == left[0]:
+                progress("tracking", done.count / len(run.chosen), _FIRST_FRAMES)
             if frame is not None and (error := _feed_one(run, k, frame, watch)):
                 return "broke down", error
             count = done.count + 1
