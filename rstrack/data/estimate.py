@@ -121,8 +121,7 @@ def write_estimate(
 def write_info(folder: Path, info: dict[str, Any]) -> None:
     """A run folder's run.json; what is not finite becomes null. Raises UserError.
 
-    A line for each entry, and for each of those that have lists of their own, as of frames: json's indentation takes
-    seconds for a minute's frames.
+    A line for each entry, and for each item of a list such as that of frames: json's own indentation is slow.
     """
     entries = [f" {json.dumps(name)}: {_entry(value)}" for name, value in plain(info).items()]
     atomic_write(folder / INFO, ("{\n" + ",\n".join(entries) + "\n}\n").encode())
