@@ -7,9 +7,11 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-# Frames' parts of one kind that are remembered. The longest of them is what the next one may take: one in a hundred
-# takes longer.
-_MEMORY = 100
+import numpy as np
+
+# Parts of one kind that are remembered, and which part of them the next one takes at most: the longest are of kernels
+# that were compiled.
+_MEMORY, _MOST = 100, 0.9
 # What comes after a frame's last step, but for parts of their own.
 _REST = "rest"
 
@@ -25,7 +27,7 @@ class Pace:
         self._budget_s = None if budget_ms is None else 1e-3 * budget_ms
         self._clock = clock
         self._took: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=_MEMORY))
-        self._is_on = False
+        self._is_on, self._reserved = False, ""
         self._begin = self._worked = self._elsewhere = 0.0
 
     def begin(self) -> None:
@@ -44,12 +46,20 @@ class Pace:
             self._took[_REST].append(self._clock() - self._worked - self._elsewhere)
         self._is_on = False
 
+    def reserve(self, name: str = "") -> None:
+        """From the next frame on keep time for a part that has to be done; nothing: for none."""
+        self._reserved = name
+
     def allows(self, *parts: str) -> bool:
         """Whether these parts would be done in time, with what always follows."""
         if not self._is_on or self._budget_s is None:
             return True
-        needed = sum(max(self._took[part], default=0.0) for part in (*parts, _REST))
+        needed = sum(self._longest(part) for part in {*parts, self._reserved, _REST})
         return self._clock() - self._begin + needed <= self._budget_s
+
+    def _longest(self, part: str) -> float:
+        took = self._took[part]
+        return float(np.quantile(took, _MOST)) if took else 0.0
 
     def allows_step(self, level: int) -> bool:
         """Whether a step of the optimiser on a level would be; after a coarse one comes another on the finest."""

@@ -127,6 +127,7 @@ class Tracker:
         """Renew the keyframe if need be; at the next frame where there is no time left, but not twice."""
         track, pace = self.track, self.track.terms.pace
         self._postponed = not self._postponed and not pace.allows(_KEYFRAME)
+        pace.reserve(_KEYFRAME if self._postponed else "")
         if self._postponed:
             return False
         with pace.part(_KEYFRAME):

@@ -147,7 +147,10 @@ class Checkpoint:
                     f"{path}: is of a run with {name} {key.get(name)}, not {self.key.get(name)}: give the same, or "
                     "track without --resume"
                 )
-        self.tracker.state = state
+        try:
+            self.tracker.state = state
+        except KeyError as error:
+            raise UserError(f"{path}: is of another version, without {error}: track without --resume") from None
         self._archive.images.put_in(self.root)
         return done
 
