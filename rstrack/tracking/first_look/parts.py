@@ -66,12 +66,11 @@ def moving_parts(dataset: Dataset, frames: range, progress: Progress) -> list[ra
 
 
 def _shift(dataset: Dataset, frames: range) -> float:
-    """Mean shift from one colour image to the next, as a part of the width, of three pairs in these frames."""
-    shifts = []
+    """Mean shift from one colour image to the next, as a part of the width, of three in a row in the middle."""
+    k = frames[len(frames) // 2]
+    near = [i for group in dataset.groups[k : k + 5] for i in group][:3]
+    small = [cv2.resize(dataset.images.color(i), (96, 72), interpolation=cv2.INTER_AREA) for i in near]
+    grey = [np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32) for image in small]
     window = cv2.createHanningWindow((96, 72), cv2.CV_32F)
-    for k in frames[len(frames) // 6 :: len(frames) // 3]:
-        near = [i for group in dataset.groups[k : k + 3] for i in group][:2]
-        small = [cv2.resize(dataset.images.color(i), (96, 72), interpolation=cv2.INTER_AREA) for i in near]
-        grey = [np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32) for image in small]
-        shifts += [math.hypot(*cv2.phaseCorrelate(a, b, window)[0]) / 96 for a, b in pairwise(grey)]
+    shifts = [math.hypot(*cv2.phaseCorrelate(a, b, window)[0]) / 96 for a, b in pairwise(grey)]
     return float(np.mean(shifts)) if shifts else 0.0
