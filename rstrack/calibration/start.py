@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
@@ -25,13 +26,11 @@ from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
 from rstrack.data.dataset import Dataset
-from rstrack.data.rig import Frame, Image
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import color_image, intensity
 from rstrack.images.sampling import level_size
 from rstrack.options import Method, Options
-from rstrack.tracking.any_tracker import AnyTracker, make_tracker
-from rstrack.tracking.first_look.depth_track import thinned, through
+from rstrack.tracking.first_look.rough_track import rough_track
 
 # How frames are followed. The second is rougher, but takes more: where the readout is far off, what the first makes of
 # depth does not fit together. The third needs colour's clock to be about right, but no shapes. Part of the time that
@@ -44,8 +43,8 @@ _GAP = 2.5
 _MARGIN_S = 0.08
 # What the colour camera may be further away than the file states, m.
 _BASELINE_M = 0.01
-# Depth images as wide as that are thinned out for the first track: they take most of its time.
-_LARGE = 480
+# Rounds of correction of a spline that is to pass through poses.
+_ROUNDS = 6
 
 
 @dataclass(frozen=True)
@@ -110,26 +109,6 @@ def tracked(dataset: Dataset, chosen: range, options: Options, progress: Progres
     return TrackedSpline(through(se3.interpolated(stamps, poses, knots), t0, dt), spans)
 
 
-def rough_track(dataset: Dataset, frames: range, options: Options, done: Callable[[float], None]) -> AnyTracker:
-    """The tracker of options.method after it has been fed the frames, as far as it, and the images, went.
-
-    done: called with what part (0 to 1) of the frames it has seen.
-    """
-    has_color = options.photometric
-    step = 2 if dataset.rig.depth_camera.width >= _LARGE and not has_color else 1
-    rig = replace(dataset.rig, depth_camera=thinned(dataset.rig.depth_camera, step))
-    tracker = make_tracker(rig, options, interval_s=dataset.interval_s(frames))
-    for count, k in enumerate(frames, 1):
-        try:
-            frame = dataset.frame(k, color=has_color)
-            z = np.ascontiguousarray(frame.depth.pixels[::step, ::step])
-            tracker.feed(Frame(Image(frame.depth.stamp, z), frame.colors))
-        except (UserError, np.linalg.LinAlgError):
-            break
-        done(count / len(frames))
-    return tracker
-
-
 def load_window(
     terms: PairTerms, dataset: Dataset, frames: Sequence[int], track: Spline, p: Parameters, options: Options
 ) -> RecordingWindow:
@@ -163,6 +142,20 @@ def like(track: Spline, t0: float, dt: float, count: int) -> Spline:
     inside = np.clip(knots, track.t_begin, track.t_end)
     poses, velocity = track.pose_and_velocity(inside)
     return through(poses @ se3.exp((knots - inside)[:, None] * velocity), t0, dt)
+
+
+def through(poses: FloatArray, t0: float, dt: float) -> Spline:
+    """The spline that passes at its knots through poses (n, 4, 4), but for the first and the last.
+
+    Cubic B-splines blur a little what their control points are laid through: a few rounds of correction.
+    """
+    wanted = se3.orthonormalise(poses)
+    points = wanted
+    knots = t0 + (np.arange(len(poses))[1:-1] - 1) * dt
+    for _ in range(_ROUNDS):
+        off = se3.log(wanted[1:-1] @ se3.inverse(Spline(points, t0, dt).pose(knots)))
+        points = np.concatenate([wanted[:1], se3.orthonormalise(se3.exp(off) @ points[1:-1]), wanted[-1:]])
+    return Spline(points, t0, dt)
 
 
 def _view(terms: PairTerms, dataset: Dataset, k: int) -> WindowFrame:

@@ -16,12 +16,12 @@ def looked_at(dataset: Dataset, chosen: range, options: Options, progress: Progr
     wants_vignetting = dataset.rig.color_falloff is None
     if not options.photometric or not (wants_offset or wants_vignetting):
         return dataset
-    # These import OpenCV and Dr.Jit.
+    # These import Dr.Jit.
     from rstrack.tracking.first_look.color_clock import estimate_color_offset
-    from rstrack.tracking.first_look.parts import DepthTracks
+    from rstrack.tracking.first_look.rough_track import GeometricTracks
     from rstrack.tracking.first_look.vignetting import estimate_vignetting
 
-    tracks = DepthTracks(dataset, chosen, progress)
+    tracks = GeometricTracks(dataset, chosen, options, progress)
     if wants_offset:
         offset = estimate_color_offset(dataset, tracks, progress)
         dataset = dataset.with_color_offset(offset.offset_s, offset.text(), sigma_s=offset.sigma_in_all_s)

@@ -1,6 +1,6 @@
 """How much later than its stamps say colour was taken, against depth: from the recording itself.
 
-found = estimate_color_offset(dataset, DepthTracks(dataset, range(len(dataset)), no_progress))
+found = estimate_color_offset(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
 dataset = dataset.with_color_offset(found.offset_s)
 
 A few seconds with motion are tracked by geometry alone, which leaves colour out. Points of depth images are then looked
@@ -12,7 +12,7 @@ pair has. What tells is that the camera turns differently at the two times: stea
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -20,33 +20,25 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
+from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import UNFOUND_OFFSET_S
-from rstrack.tracking.first_look.depth_track import DepthTrack
-from rstrack.tracking.first_look.lookup import (
-    MOST_NOISE,
-    disagreement,
-    image_of,
-    pairs_in,
-    pixels_of,
-    points_of,
-    values_at,
-)
+from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, points_of
 
 # For the progress bar.
-_STAGE, _NOTE = "colour's clock", "comparing colour images"
+_STAGE = "colour's clock"
 # Offsets looked at (s): coarse ones, then fine ones about the best.
 _MOST_S, _COARSE_S, _FINE_S = 0.06, 0.01, 0.0025
-# Of the points every so manieth is enough for the coarse ones.
-_FEW = 4
 # Fine offsets on each side of the best one through which a parabola is laid.
 _NEAR = 2
 # The fewest points that a pair may share.
-_FEWEST = 100
+_FEWEST = 400
 # The offset is taken for determined if its standard error is below this, and it lies inside of what was looked at.
 _MOST_SIGMA_S = 5e-3
 # σ of what the pairs of a part have wrong alike: three parts of a recording gave 2.9 ± 0.5, 6.1 ± 0.6, 4.3 ± 1.4 ms.
 _SYSTEMATIC_S = 1.5e-3
+# Noise of colour images against each other, over their contrast, above which the track is not to be believed.
+_MOST_NOISE = 0.25
 
 
 @dataclass(frozen=True)
@@ -78,7 +70,7 @@ class ColorOffset:
 
 
 def estimate_color_offset(
-    dataset: Dataset, tracks: Iterable[DepthTrack | None], progress: Progress = no_progress
+    dataset: Dataset, tracks: Iterable[GeometricTrack | None], progress: Progress = no_progress
 ) -> ColorOffset:
     """Seconds to add to a dataset's colour stamps: by one part after the other, until the pairs of one differ by less
     than parts do, and by the one whose pairs differ least. Raises UserError: an image that cannot be read.
@@ -91,24 +83,24 @@ def estimate_color_offset(
     return min(tried, key=lambda found: (bool(found.reason), found.sigma_s))
 
 
-def _estimate(dataset: Dataset, track: DepthTrack | None, progress: Progress) -> ColorOffset:
+def _estimate(dataset: Dataset, track: GeometricTrack | None, progress: Progress) -> ColorOffset:
     if track is None:
         return ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track")
+    spline = track.spline
     pairs = pairs_in(dataset, track.frames, track.begin + _MOST_S, track.end - _MOST_S)
     if len(pairs) < 6:
         return ColorOffset(0.0, np.inf, len(pairs), "too few images overlap")
     coarse = np.arange(-_MOST_S, _MOST_S + 1e-9, _COARSE_S)
-    costs, noise = _costs(dataset, track, pairs, coarse, _FEW, lambda done: progress(_STAGE, 0.5 * done, _NOTE))
+    costs, noise = _costs(dataset, spline, pairs, coarse, progress)
     if len(costs) < 6:
         return ColorOffset(0.0, np.inf, len(costs), "too few images overlap")
-    if np.median(noise) > MOST_NOISE:
+    if np.median(noise) > _MOST_NOISE:
         return ColorOffset(0.0, np.inf, len(costs), "colour does not fit the track that depth alone gives")
     best = int(np.argmin(costs.sum(axis=0)))
     if best in (0, len(coarse) - 1):
         return ColorOffset(0.0, np.inf, len(costs), f"it would be beyond {1e3 * _MOST_S:.0f} ms")
     fine = coarse[best] + np.arange(-5, 6) * _FINE_S
-    finer = _costs(dataset, track, pairs, fine, 1, lambda done: progress(_STAGE, 0.5 + 0.5 * done, _NOTE))
-    return _minimum(fine, finer[0])
+    return _minimum(fine, _costs(dataset, spline, pairs, fine, progress)[0])
 
 
 def _minimum(offsets: FloatArray, costs: FloatArray) -> ColorOffset:
@@ -141,27 +133,42 @@ def _parabola(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 
 def _costs(
-    dataset: Dataset, track: DepthTrack, pairs: Sequence[tuple[int, int, int]], offsets: FloatArray, every: int,
-    done: Callable[[float], None],
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast.
-
-    every: of the points that are looked up.
-    """
-    points = lru_cache(maxsize=1)(lambda k: points_of(dataset, track.spline, k)[::every])
-
-    @lru_cache(maxsize=4)
-    def seen(k: int, i: int) -> FloatArray:
-        return values_at(
-            image_of(dataset, track, i), pixels_of(dataset, track.spline, points(k), dataset.color_stamps[i] + offsets)
-        )
-
+    dataset: Dataset, spline: Spline, pairs: Sequence[tuple[int, int, int]], offsets: FloatArray, progress: Progress
+) -> tuple[FloatArray, FloatArray]:
+    """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast."""
+    points = lru_cache(maxsize=2)(lambda k: points_of(dataset, spline, k))
+    images = lru_cache(maxsize=16)(lambda i: image_of(dataset.images.color(i)))
     found = [(np.empty((0, len(offsets))), np.empty(0))]
     for n, (k, i, j) in enumerate(pairs):
-        a, b = seen(k, i), seen(k, j)
+        a, b = (looked_up(dataset, spline, images(m), points(k), dataset.color_stamps[m] + offsets) for m in (i, j))
         good = np.isfinite(a).all(axis=0) & np.isfinite(b).all(axis=0)
-        if np.count_nonzero(good) * every >= _FEWEST:
-            cost, noise = disagreement(a[:, good], b[:, good])
+        if np.count_nonzero(good) >= _FEWEST:
+            cost, noise = _disagreement(a[:, good], b[:, good])
             found.append((cost[None], np.array([noise])))
-        done((n + 1) / len(pairs))
+        progress(_STAGE, (n + 1) / len(pairs), "comparing colour images")
     return np.concatenate([costs for costs, _ in found]), np.concatenate([noise for _, noise in found])
+
+
+def _disagreement(a: FloatArray, b: FloatArray) -> tuple[FloatArray, float]:
+    """Student-t cost (m,) of intensities b (m, n) against gain · a + offset, fitted to each of the m; and its σ over
+    that of b.
+
+    One σ for all, from where they agree best: the costs are log-likelihoods up to a constant, for n independent points.
+    """
+    errors = np.array([_residuals(x, y) for x, y in zip(a, b, strict=True)])
+    sigma = max(float(np.min(1.4826 * np.median(np.abs(errors), axis=1))), 1e-3)
+    contrast = max(1.4826 * float(np.median(np.abs(b - np.median(b)))), 1e-3)
+    return np.asarray(3.0 * np.log1p((errors / sigma) ** 2 / 5.0).sum(axis=1)), sigma / contrast
+
+
+def _residuals(x: FloatArray, y: FloatArray) -> FloatArray:
+    """y − gain · x − offset (n,), fitted with Student-t weights (ν = 5); closed form in every round."""
+    w = np.ones(len(x))
+    for _ in range(4):
+        mean_x, mean_y = np.average(x, weights=w), np.average(y, weights=w)
+        spread = np.average((x - mean_x) ** 2, weights=w)
+        gain = np.average((x - mean_x) * (y - mean_y), weights=w) / max(float(spread), 1e-12)
+        r = y - mean_y - gain * (x - mean_x)
+        sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-3)
+        w = 6.0 / (5.0 + (r / sigma) ** 2)
+    return r

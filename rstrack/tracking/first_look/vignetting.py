@@ -1,6 +1,6 @@
 """How much darker colour images are towards their corners (vignetting): from the recording itself.
 
-found = estimate_vignetting(dataset, DepthTracks(dataset, range(len(dataset)), no_progress))
+found = estimate_vignetting(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
 dataset = dataset.with_color_falloff(found.strength, found.text())
 
 It stays where it is while the scene passes by, which biases every alignment of colours towards no motion. A point that
@@ -24,20 +24,10 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import corner_distance2
-from rstrack.tracking.first_look.depth_track import DepthTrack
-from rstrack.tracking.first_look.lookup import (
-    MOST_NOISE,
-    disagreement,
-    image_of,
-    pairs_in,
-    pixels_of,
-    points_of,
-    rests,
-    values_at,
-)
+from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, points_of, rests
 
 # The fewest points that a pair of images may share, and pairs.
-_FEWEST_POINTS, _FEWEST_PAIRS = 100, 6
+_FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
 # Mean and σ of the vignetting of a lens that nothing is known of: TUM's cameras have 0.09 and 0.45.
 _PRIOR, _PRIOR_SIGMA = 0.15, 0.15
 # σ of what all pairs of a part have wrong alike: of one camera parts gave 0.09, 0.09 and 0.02, of another, whose
@@ -73,15 +63,9 @@ class _Pair:
     intensity: tuple[FloatArray, FloatArray]
     distance2: tuple[FloatArray, FloatArray]
 
-    @property
-    def noise(self) -> float:
-        """Of one image against the other, over the contrast."""
-        a, b = self.intensity
-        return disagreement(a[None], b[None])[1]
-
 
 def estimate_vignetting(
-    dataset: Dataset, tracks: Iterable[DepthTrack | None], progress: Progress = no_progress
+    dataset: Dataset, tracks: Iterable[GeometricTrack | None], progress: Progress = no_progress
 ) -> Vignetting:
     """The vignetting of a dataset's colour images, from the part that moves most of those where enough pairs overlap.
 
@@ -89,7 +73,7 @@ def estimate_vignetting(
     """
     for track in tracks:
         pairs = [] if track is None else _compared(dataset, track, progress)
-        if len(pairs) >= _FEWEST_PAIRS and np.median([pair.noise for pair in pairs]) <= MOST_NOISE:
+        if len(pairs) >= _FEWEST_PAIRS:
             measured, sigma = _solved(pairs)
             information, prior = sigma**-2, _PRIOR_SIGMA**-2
             mean = (information * measured + prior * _PRIOR) / (information + prior)
@@ -97,24 +81,23 @@ def estimate_vignetting(
     return Vignetting(_PRIOR, _PRIOR_SIGMA, 0)
 
 
-def _compared(dataset: Dataset, track: DepthTrack, progress: Progress) -> list[_Pair]:
+def _compared(dataset: Dataset, track: GeometricTrack, progress: Progress) -> list[_Pair]:
     camera, spline = dataset.rig.color_camera, track.spline
     distance2 = corner_distance2(camera.width, camera.height)[::2, ::2]
-    points = lru_cache(maxsize=1)(lambda k: points_of(dataset, spline, k))
-
-    @lru_cache(maxsize=4)
-    def seen(k: int, i: int) -> tuple[FloatArray, FloatArray]:
-        uv = pixels_of(dataset, spline, points(k), dataset.color_stamps[i : i + 1])
-        return values_at(image_of(dataset, track, i), uv)[0], values_at(distance2, uv)[0]
-
+    points = lru_cache(maxsize=2)(lambda k: points_of(dataset, spline, k))
+    images = lru_cache(maxsize=16)(lambda i: image_of(dataset.images.color(i)))
     found = []
     chosen = pairs_in(dataset, track.frames, track.begin, track.end)
     for n, (k, i, j) in enumerate(chosen):
-        (a, near), (b, far) = seen(k, i), seen(k, j)
+        seen, at = [], []
+        for m in (i, j):
+            stamp = dataset.color_stamps[m : m + 1]
+            seen.append(looked_up(dataset, spline, images(m), points(k), stamp)[0])
+            at.append(looked_up(dataset, spline, distance2, points(k), stamp)[0])
         later = int(np.abs(dataset.stamps - dataset.color_stamps[j]).argmin())
-        good = np.isfinite([a, b, near, far]).all(axis=0) & rests(dataset, spline, points(k), later)
+        good = np.isfinite([*seen, *at]).all(axis=0) & rests(dataset, spline, points(k), later)
         if np.count_nonzero(good) >= _FEWEST_POINTS:
-            found.append(_Pair((a[good], b[good]), (near[good], far[good])))
+            found.append(_Pair((seen[0][good], seen[1][good]), (at[0][good], at[1][good])))
         progress("colour's corners", (n + 1) / len(chosen), "comparing colour images")
     return found
 

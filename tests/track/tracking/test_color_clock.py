@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,10 +20,9 @@ from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
-from rstrack.tracking.first_look import color_clock, looked_at, lookup, parts
+from rstrack.tracking.first_look import color_clock, looked_at, rough_track
 from rstrack.tracking.first_look.color_clock import ColorOffset, estimate_color_offset
-from rstrack.tracking.first_look.depth_track import DepthTrack
-from rstrack.tracking.first_look.parts import DepthTracks
+from rstrack.tracking.first_look.rough_track import GeometricTrack, GeometricTracks
 from rstrack.tracking.runs.run import track
 
 WRONG_S = 0.0173
@@ -33,7 +33,7 @@ needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the points of images as small as these, in a third of the time."""
-    monkeypatch.setattr(lookup, "_ACROSS", 80)
+    monkeypatch.setattr(rough_track, "_ACROSS", 80)
     monkeypatch.setattr(color_clock, "_FEWEST", 100)
 
 
@@ -75,8 +75,8 @@ def wrongly_stamped(dataset: Dataset, by_s: float) -> Dataset:
     )
 
 
-def along(path: Spline | None) -> list[DepthTrack | None]:
-    return [None if path is None else DepthTrack(range(30), path, path.t_begin, path.t_end)]
+def along(path: Spline | None) -> list[GeometricTrack | None]:
+    return [None if path is None else GeometricTrack(range(30), path, path.t_begin, path.t_end)]
 
 
 @pytest.mark.parametrize("wrong_s", [WRONG_S, -0.025, 0.0])
@@ -95,16 +95,20 @@ def test_a_track_that_colour_contradicts_is_not_believed(shaken: Dataset) -> Non
     assert "does not fit the track" in found.reason and found.offset_s == 0.0
 
 
-def test_a_part_is_tracked_once(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[range] = []
+def test_a_clock_is_looked_for_by_depth_alone_along_a_track_that_is_made_once(
+    shaken: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A track that follows colours agrees with whatever clock it takes them to have."""
+    asked: list[tuple[range, str]] = []
 
-    def lost(_: Dataset, frames: range, done: Callable[[float], None]) -> None:
-        asked.append(frames)
+    def lost(_: Dataset, frames: range, options: Options, done: Callable[[float], None]) -> object:
+        asked.append((frames, options.method))
         done(1.0)
+        return SimpleNamespace(spline_valid=(), spline=None)
 
-    monkeypatch.setattr(parts, "depth_track", lost)
-    tracks = DepthTracks(shaken, range(9), no_progress)
-    assert list(tracks) == list(tracks) == [None] and asked == [range(9)]
+    monkeypatch.setattr(rough_track, "rough_track", lost)
+    tracks = GeometricTracks(shaken, range(9), Options(), no_progress)
+    assert list(tracks) == list(tracks) == [None] and asked == [(range(9), "rs-g")]
 
 
 @needs_rpy
@@ -113,7 +117,7 @@ def test_the_offset_of_a_kinect(tmp_path: Path) -> None:
     camera = "color: {width: 640, height: 480, intrinsics: [525, 525, 319.5, 239.5], readout_s: 0.03}"
     (tmp_path / "camera.yaml").write_text(camera)
     dataset = open_dataset(RPY, tmp_path / "camera.yaml")
-    found = estimate_color_offset(dataset, DepthTracks(dataset, range(60, 120), no_progress))
+    found = estimate_color_offset(dataset, GeometricTracks(dataset, range(60, 120), Options(), no_progress))
     assert not found.reason and 0.015 < found.offset_s < 0.026 and found.sigma_s < 3e-3
 
 
@@ -129,20 +133,21 @@ def test_what_the_motion_does_not_tell_is_left_open(shaken: Dataset) -> None:
 
 
 def test_where_one_part_does_not_tell_others_are_asked(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "_TRACKED", 8)
+    monkeypatch.setattr(rough_track, "_TRACKED", 8)
     asked: list[range] = []
 
-    def lost(_: Dataset, part: range, *__: object) -> None:
+    def lost(_: Dataset, part: range, *__: object) -> object:
         asked.append(part)
+        return SimpleNamespace(spline_valid=(), spline=None)
 
-    monkeypatch.setattr(parts, "depth_track", lost)
-    tracks = DepthTracks(shaken, range(len(shaken)), no_progress)
+    monkeypatch.setattr(rough_track, "rough_track", lost)
+    tracks = GeometricTracks(shaken, range(len(shaken)), Options(), no_progress)
     found = estimate_color_offset(replace(shaken, images=Brightness(shaken)), (*tracks, *along(shaken.truth)))
     assert not found.reason and abs(found.offset_s) < 1e-3
     assert not set(asked[0]) & set(asked[1]) and {len(part) for part in asked} == {8}
     asked.clear()
-    monkeypatch.setattr(parts, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
-    tracks = DepthTracks(shaken, range(len(shaken)), no_progress)
+    monkeypatch.setattr(rough_track, "_shift", lambda _, part: 0.012 if 20 in part else 1e-4 * part[0])
+    tracks = GeometricTracks(shaken, range(len(shaken)), Options(), no_progress)
     assert estimate_color_offset(shaken, tracks).reason, "none of three told"
     assert len(asked) == 3 and 20 in asked[0] and asked[1][0] > asked[2][0]
     assert len(set().union(*asked)) == 24

@@ -17,9 +17,8 @@ from rstrack.data.estimate import read_estimate
 from rstrack.images.device_frame import DeviceRig
 from rstrack.images.pyramid import corner_distance2
 from rstrack.options import Options
-from rstrack.tracking.first_look import lookup, vignetting
-from rstrack.tracking.first_look.depth_track import DepthTrack
-from rstrack.tracking.first_look.parts import DepthTracks
+from rstrack.tracking.first_look import rough_track, vignetting
+from rstrack.tracking.first_look.rough_track import GeometricTrack, GeometricTracks
 from rstrack.tracking.first_look.vignetting import Vignetting, estimate_vignetting
 from rstrack.tracking.runs.run import track
 
@@ -30,7 +29,7 @@ needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the points of images as small as these, in a third of the time."""
-    monkeypatch.setattr(lookup, "_ACROSS", 80)
+    monkeypatch.setattr(rough_track, "_ACROSS", 80)
 
 
 class Darkened:
@@ -46,10 +45,10 @@ class Darkened:
         return np.rint(np.clip(self._images.color(k) * self._factor * gain, 0, 255)).astype(np.uint8)
 
 
-def true_path(dataset: Dataset, frames: range | None = None) -> list[DepthTrack | None]:
+def true_path(dataset: Dataset, frames: range | None = None) -> list[GeometricTrack | None]:
     truth = dataset.truth
     assert truth is not None
-    return [DepthTrack(frames or range(len(dataset)), truth, truth.t_begin, truth.t_end)]
+    return [GeometricTrack(frames or range(len(dataset)), truth, truth.t_begin, truth.t_end)]
 
 
 @pytest.mark.parametrize("corner", [0.3, 0.06, 0.5])
@@ -106,11 +105,11 @@ class Covered:
 def test_points_that_depth_does_not_show_where_they_were_do_not_count(shaken: Dataset) -> None:
     """Regression: beside things that move the corners were found to be 16 % brighter where they were darker."""
     assert shaken.truth is not None
-    p_world, covered = lookup.points_of(shaken, shaken.truth, 0), replace(shaken, images=Covered(shaken))
-    still = lookup.rests(shaken, shaken.truth, p_world, 0)
-    hidden = lookup.rests(covered, shaken.truth, p_world, 0)
+    p_world, covered = rough_track.points_of(shaken, shaken.truth, 0), replace(shaken, images=Covered(shaken))
+    still = rough_track.rests(shaken, shaken.truth, p_world, 0)
+    hidden = rough_track.rests(covered, shaken.truth, p_world, 0)
     assert still.mean() > 0.97 and not (hidden & ~still).any() and 0.4 < hidden.mean() < 0.6
-    later = lookup.rests(shaken, shaken.truth, p_world, 6)
+    later = rough_track.rests(shaken, shaken.truth, p_world, 6)
     assert 0.5 < later.mean() < 1.0
 
 
@@ -121,7 +120,7 @@ def test_a_kinect_darkens(tmp_path: Path) -> None:
         "color: {width: 640, height: 480, intrinsics: [525, 525, 319.5, 239.5], readout_s: 0.03, offset_s: 0.018}"
     )
     dataset = open_dataset(RPY, tmp_path / "camera.yaml")
-    found = estimate_vignetting(dataset, DepthTracks(dataset, range(60, 160), no_progress))
+    found = estimate_vignetting(dataset, GeometricTracks(dataset, range(60, 160), Options(), no_progress))
     assert found.strength == pytest.approx(0.097, abs=0.02) and found.sigma < 0.055
 
 
