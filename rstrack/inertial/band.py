@@ -111,7 +111,7 @@ def _spectrum(
 
     t: even times to take it at. density: of the noise.
     """
-    from scipy.signal import welch  # a quarter of all that a run imports, which only an IMU needs
+    from scipy.signal import welch  # only an IMU needs it
 
     told = (np.isfinite(values) & ~outliers(values, density * np.sqrt(rate_hz))).all(axis=1)
     even: FloatArray = np.stack([np.interp(t, at[told], axis[told]) for axis in values.T])
