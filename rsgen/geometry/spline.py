@@ -26,9 +26,10 @@ Side = Literal["left", "right"]
 
 # b_1..b_3 as polynomials in u, constant term first.
 _BASIS = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0, 1.0]]).T / 6.0
-# Its derivatives by u, of orders 0, 1, 2: of powers (..., 4) by powers.
-_BY_U = np.diag([1.0, 2.0, 3.0], 1)
-BASES = _BASIS, _BY_U @ _BASIS, _BY_U @ _BY_U @ _BASIS
+BY_U = np.diag([1.0, 2.0, 3.0], 1)
+"""Derives polynomials in u, constant term first."""
+BASES = _BASIS, BY_U @ _BASIS, BY_U @ BY_U @ _BASIS
+"""b_1..b_3 and their first and second derivatives by u, (4, 3) each: powers of u times these."""
 _ORTHONORMAL_WITHIN = 1e-6
 # Times evaluated at once: intermediate results then stay in the cache, which halves the time of large batches.
 _BLOCK = 4096

@@ -20,7 +20,7 @@ from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, cross
 from rstrack.alignment.weights import cost, curvature, weight
-from rstrack.images.fast_se3 import compiled
+from rstrack.compiled import compiled
 
 # Blocks of lines that share one linearisation by the control points: half of a millisecond (eight of 480 lines lose
 # nothing).

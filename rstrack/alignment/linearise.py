@@ -40,8 +40,8 @@ from rstrack.alignment.weights import (
     inflation,
     scale_step,
 )
+from rstrack.compiled import compiled
 from rstrack.images.device_frame import DeviceRig, Timer, untimed
-from rstrack.images.fast_se3 import compiled
 from rstrack.images.line_poses import Exposure, from_base, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import Points, Reference, pyramid_level, strides

@@ -19,7 +19,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import BlockSums
-from rstrack.images.fast_se3 import compiled
+from rstrack.compiled import compiled
 from rstrack.images.fast_spline import jacobians
 
 

@@ -18,8 +18,8 @@ from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic, block_diagonal
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH, START_INTENSITY
+from rstrack.compiled import compiled
 from rstrack.images.device_frame import DeviceFrame
-from rstrack.images.fast_se3 import compiled
 from rstrack.images.fast_spline import motion
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.keyframe import THINNED, Reference

@@ -11,7 +11,7 @@ from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
-from rstrack.images.fast_se3 import compiled
+from rstrack.compiled import compiled
 
 ACCELERATION = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
 """Motion prior: standard deviation of accelerations, m/s² and rad/s². Hand-held cameras reach 35 m/s²,

@@ -1,7 +1,7 @@
 """Rigid motions in compiled code: twins of `rsgen.geometry.se3` for one motion, which the tests compare.
 
 A vector is a tuple of three numbers, a 3×3 matrix one of nine, row by row; an adjoint or left Jacobian [[D, C], [0, D]]
-is its two blocks. Numba compiles a function when a machine first calls it and stores it beside this file.
+is its two blocks.
 """
 
 from __future__ import annotations
@@ -9,23 +9,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from rsgen.geometry import se3, so3
+from rstrack.compiled import compiled
 
 EXP, _INVERSE, _CORNER = (np.ascontiguousarray(s.T) for s in (so3.EXP_SERIES, so3.INVERSE_SERIES, se3.CORNER_SERIES))
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _NEWTON_STEPS = 3  # towards the nearest rotation: quadratic, from a product of two that has drifted by rounding
-
-
-def compiled(function: Any) -> Any:
-    """A function compiled by Numba, and stored on the disk where there is a folder to write to."""
-    try:
-        return numba.njit(cache=True)(function)
-    except RuntimeError:  # no such folder
-        return numba.njit(function)
-
 
 # -- vectors and matrices ---------------------------------------------------------------------------------------------
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import BASES, Spline
+from rstrack.compiled import compiled
 from rstrack.images.fast_se3 import (
     EXP,
     added,
-    compiled,
     corner,
     cross,
     exp,

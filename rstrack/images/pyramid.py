@@ -8,13 +8,13 @@ from functools import cached_property
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.geometry.camera import Camera
+from rstrack.compiled import compiled
 from rstrack.images.line_poses import Exposure
 
 LEVELS = 3
@@ -105,7 +105,7 @@ def depth_image(
     return DepthImage(exposure, e.upload(cleaned), e.upload(inverse), count, resolution)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _cleaned(
     z: npt.NDArray[np.float32], sees: npt.NDArray[np.bool_], most: np.float32
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], int]:

@@ -18,13 +18,7 @@ import numpy as np
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import cross, hat, powers
-from rsgen.geometry.spline import Spline
-
-# b_1..b_3 as polynomials in u, and their derivatives by u: see `rsgen.geometry.spline`.
-_BASIS = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0, 1.0]]).T / 6.0
-BY_U = np.diag([1.0, 2.0, 3.0], 1)
-"""Derives polynomials in u, constant term first."""
-_BASES = _BASIS, BY_U @ _BASIS, BY_U @ BY_U @ _BASIS
+from rsgen.geometry.spline import BASES, Spline
 
 
 @dataclass(frozen=True)
@@ -122,7 +116,7 @@ def motion(spline: Spline, t: FloatArray) -> BodyMotion:
     segment, u = spline.locate(t)
     held, n = segment - spline.first, len(u)
     p = powers(u, 4)
-    b, db, ddb = (p @ basis / spline.dt**k for k, basis in enumerate(_BASES))
+    b, db, ddb = (p @ basis / spline.dt**k for k, basis in enumerate(BASES))
     three = held[:, None] + np.arange(3)
     omega = spline.increments[three]
     parts = b[..., None] * omega

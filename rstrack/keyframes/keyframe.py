@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -15,6 +14,7 @@ from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rstrack.compiled import compiled
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import LEVELS, masked_pyramid
 from rstrack.images.sampling import NEAREST
@@ -162,7 +162,7 @@ def level_points(
     return tuple(out)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _sampled(
     rho: FloatImage, whole: Mask, rays: FloatArray, image: FloatImage, known: Mask, stride: int, halved: int
 ) -> tuple[FloatImage, ...]:  # fmt: skip

@@ -6,10 +6,10 @@ the device do, and a seventh of what whole arrays take, one operation after the 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from rstrack.compiled import compiled
 from rstrack.images.sampling import EDGE
 
 # Normals come from a window of so many pixels; the residual itself is not smoothed.
@@ -18,10 +18,9 @@ _EDGE = np.float32(EDGE)
 
 Row = npt.NDArray[np.float32]
 Image = npt.NDArray[np.float32]
-_compiled = numba.njit(cache=True, error_model="numpy")
 
 
-@_compiled
+@compiled
 def _steps(before: Row, after: Row, step: Row, counts: Row) -> None:
     """What inverse depth changes by from pixels to their neighbours, and 1 where it does so on one surface, else 0."""
     for x in range(step.size):
@@ -31,32 +30,32 @@ def _steps(before: Row, after: Row, step: Row, counts: Row) -> None:
         counts[x] = np.float32(1.0) if is_on else np.float32(0.0)
 
 
-@_compiled
+@compiled
 def _two(a: Row, b: Row, total: Row) -> None:
     for x in range(total.size):
         total[x] = a[x] + b[x]
 
 
-@_compiled
+@compiled
 def _five(a: Row, b: Row, c: Row, d: Row, e: Row, total: Row) -> None:
     for x in range(total.size):
         total[x] = a[x] + b[x] + c[x] + d[x] + e[x]
 
 
-@_compiled
+@compiled
 def _over_window(row: Row, total: Row) -> None:
     """Sums over the window's pixels of a row; it has two more at each end, which become mirror images."""
     row[0], row[1], row[-1], row[-2] = row[4], row[3], row[-5], row[-4]
     _five(row[:-4], row[1:-3], row[2:-2], row[3:-1], row[4:], total)
 
 
-@_compiled
+@compiled
 def _mean(total: Row, count: Row, focal: np.float32, mean: Row) -> None:
     for x in range(total.size):
         mean[x] = focal * total[x] / (count[x] if count[x] > 1.0 else np.float32(1.0))
 
 
-@_compiled
+@compiled
 def _rows(middle: int, height: int) -> tuple[int, int, int, int, int]:
     """Where the window's rows, mirrored at the image's border, are among the last five."""
     last = height - 1
@@ -65,7 +64,7 @@ def _rows(middle: int, height: int) -> tuple[int, int, int, int, int]:
     return upper % 5, up % 5, middle % 5, down % 5, lower % 5
 
 
-@_compiled
+@compiled
 def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
     """Derivatives of inverse depth (h, w) by normalised coordinates, averaged over a window without crossing edges.
 
@@ -105,7 +104,7 @@ def surface_slopes(rho: Image, fx: float, fy: float) -> tuple[Image, Image]:
     return slope_x, slope_y
 
 
-@_compiled
+@compiled
 def surface_bends(slope_x: Image, slope_y: Image, fx: float, fy: float) -> tuple[Image, Image]:
     """Size of the second differences (h, w) of inverse depth from pixel to pixel, along rows and columns."""
     height, width = slope_x.shape
@@ -119,7 +118,7 @@ def surface_bends(slope_x: Image, slope_y: Image, fx: float, fy: float) -> tuple
     return bend_x, bend_y
 
 
-@_compiled
+@compiled
 def surface_roughness(rho: Image, slope_x: Image, slope_y: Image, fx: float, fy: float) -> Image:
     """Error (h, w) in m that bilinear interpolation of inverse depth may have: an eighth of its second difference.
 
@@ -137,7 +136,7 @@ def surface_roughness(rho: Image, slope_x: Image, slope_y: Image, fx: float, fy:
     return bend_x
 
 
-@_compiled
+@compiled
 def on_one_surface(rho: Image) -> npt.NDArray[np.bool_]:
     """Pixels (h, w) with depth whose neighbours right, left, above and below do not lie across an edge."""
     height, width = rho.shape

@@ -19,8 +19,8 @@ from scipy import sparse
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import so3
 from rsgen.geometry.so3 import cross, hat
-from rsgen.geometry.spline import Spline
-from rstrack.inertial.factor import BY_U, BodyMotion, ImuFactor
+from rsgen.geometry.spline import BY_U, Spline
+from rstrack.inertial.factor import BodyMotion, ImuFactor
 
 NAMES = (
     "T_imu_depth.rx", "T_imu_depth.ry", "T_imu_depth.rz", "lever.x", "lever.y", "lever.z", "offset_s", "drift",

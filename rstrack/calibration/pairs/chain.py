@@ -12,7 +12,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rstrack.alignment.block_sums import BlockSums, Scaling
 from rstrack.calibration.pairs.images import LinePoses
 from rstrack.calibration.parameters import COUNT
-from rstrack.images.fast_se3 import compiled
+from rstrack.compiled import compiled
 
 # σ of gain and offset of an image against another, and the least and the most that they become.
 _BRIGHTNESS, _BRIGHTNESS_BOUNDS = np.array([0.3, 0.15]), (-0.7, 2.0)

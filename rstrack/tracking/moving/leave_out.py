@@ -12,7 +12,6 @@ from typing import Any
 
 import cv2
 import drjit as dr
-import numba
 import numpy as np
 
 from rsgen.device.arrays import Engine
@@ -22,6 +21,7 @@ from rstrack.alignment.free_space import Free, FreeSpace, Grid, Look, SeenFrom, 
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH
+from rstrack.compiled import compiled
 from rstrack.data.moving_masks import Mask
 from rstrack.images.device_frame import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
@@ -92,7 +92,7 @@ def moving_with(seen: SeenFrom, left_out: Mask, sigma_depth: float, median_depth
     return _widened(grown) if seeds.any() else nowhere
 
 
-@numba.njit(cache=True)
+@compiled
 def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Grid]:
     """σ (m) at depths z, and how far before what was seen something has to stand to be in free space."""
     share = z / np.float32(median_depth)
@@ -100,7 +100,7 @@ def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Gri
     return scale, np.maximum(np.float32(_BEFORE_M) + np.float32(EDGE) * z, np.float32(_BEFORE_SIGMAS) * scale)
 
 
-@numba.njit(cache=True)
+@compiled
 def _in_free_space(seen: Grid, z: Grid, sigma_depth: float, median_depth: float) -> Mask:
     """Pixels (gh, gw) at depths z that stand so far (`seen`, m) before what was seen there."""
     return np.asarray(seen > _scales(z, sigma_depth, median_depth)[1])
