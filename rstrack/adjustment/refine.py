@@ -179,8 +179,9 @@ class Refiner:
                     fused[k] = self.maker.fused(fused[k], frame.depth, spline, _FUSED)
             show(0.4 * (n + 1) / len(self.frames), note)
         done = []
+        shape = made[0].lens.camera.height, made[0].lens.camera.width
         for k, frame in enumerate(self.load(numbers)):
-            rho, weight = fused[k].inverse_depth, fused[k].weight
+            rho, weight = (self.maker.e.download(a, shape) for a in (fused[k].inverse_depth, fused[k].weight))
             done.append(self.maker.with_depth(made[k], frame.depth, frame.colors, spline, rho, weight))
             show(0.4 + 0.1 * (k + 1) / len(numbers), note)
         return done

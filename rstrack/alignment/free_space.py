@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -39,6 +38,8 @@ from rstrack.images.sampling import (
 )
 from rstrack.keyframes.keyframe import Reference, pyramid_level, strides
 
+# What a kernel writes where nothing is known: no metres, and no intensity, are as large.
+_UNKNOWN = 1e6
 # Pixels of the largest grid that is compared: what moves need not be known to the pixel.
 _GRID_PX = 160 * 120
 
@@ -84,7 +85,7 @@ def _moved(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool, give
 
 
 def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[SpaceInput], Any]:
-    """Kernel → (z, free) at every stride-th pixel of `lens`, see `Free`.
+    """Kernel → (1/z, free) at every stride-th pixel of `lens`, see `Free`: 0 and `_UNKNOWN` where that is not known.
 
     has_rays: whether the image's rays are given; a rectified one's are those of its pinhole.
     """
@@ -101,26 +102,28 @@ def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays:
                 y = dr.clip(seen.y + dy, 0.0, there.height - 1.0)
                 at = nearest(e, there.width, x, y, inside)
                 nearest_rho = dr.maximum(nearest_rho, dr.gather(e.Float, given.other, at, inside))
-        z, known = depth_of(rho)
-        there_z, shown = depth_of(nearest_rho)
-        return dr.select(known, z, dr.nan), dr.select(inside & shown, there_z - seen.z, dr.nan)
+        shown = inside & (nearest_rho > 0.0)
+        return rho, dr.select(shown, dr.rcp(dr.select(shown, nearest_rho, 1.0)) - seen.z, _UNKNOWN)
 
     return kernel
 
 
 def meeting_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool) -> Callable[[MeetingInput], Any]:
-    """Kernel → (apart, value, 1 where inside the other image) at the same pixels, see `SeenFrom`."""
+    """Kernel → (apart, value) at the same pixels, see `SeenFrom`.
+
+    `_UNKNOWN` where that is not known; a value of twice that outside the other image.
+    """
     columns = -(-other.camera.width // stride)
 
     @recorded_from(MeetingInput)
     def kernel(given: MeetingInput) -> Any:
         _, seen, inside = _moved(e, lens, other, stride, has_rays, given)
         value, met = surface(e, other.camera, given.other, seen.x, seen.y, inside)
-        apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, dr.nan)
+        apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, _UNKNOWN)
         column = e.UInt(e.Int(dr.select(inside, (seen.x + 0.5) / stride, 0.0)))
         row = e.UInt(e.Int(dr.select(inside, (seen.y + 0.5) / stride, 0.0)))
-        handed = dr.select(inside, dr.gather(e.Float, given.values, row * columns + column, inside), dr.nan)
-        return apart, handed, dr.select(inside, e.Float(1.0), 0.0)
+        handed = dr.select(inside, dr.gather(e.Float, given.values, row * columns + column, inside), 2.0 * _UNKNOWN)
+        return apart, handed
 
     return kernel
 
@@ -141,7 +144,7 @@ class IntensityInput:
 
 
 def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: int) -> Callable[[IntensityInput], Any]:
-    """Kernel → the colour image's intensity less the one expected, of each of the keyframe's points; NaN: unknown."""
+    """Kernel → the colour image's intensity less the one expected, of each of the keyframe's points."""
     width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
     shrink, ref = 0.5**level, ref_lens.camera
 
@@ -154,7 +157,7 @@ def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: 
         value, active = bilinear_value(e, given.image, width, height, seen.x * shrink, seen.y * shrink, active)
         gain, offset = (dr.gather(e.Float, given.brightness, e.UInt(i)) for i in (0, 1))
         expected = given.intensity + dr.fma(gain, given.intensity - MID_GREY, offset)
-        return dr.select(active, value - expected, dr.nan)  # NaN also where clipped
+        return dr.select(active & dr.isfinite(value), value - expected, _UNKNOWN)
 
     return kernel
 
@@ -188,18 +191,31 @@ class FreeSpace:
     """Kernels of one rig. Poses of lines are those of T_world_depth(t)."""
 
     device: DeviceRig
-    kernel: Kernels = field(init=False)
+    _kernel: Kernels = field(init=False)
 
     def __post_init__(self) -> None:
-        self.kernel = Kernels(self.device.e)
+        self._kernel = Kernels(self.device.e)
 
-    def look(self, one: Reference | DepthImage, other: Reference | DepthImage, spline: Spline) -> Look:
+    def before(self, one: Reference | DepthImage, other: Reference | DepthImage, spline: Spline) -> Free:
         """The pixels of one image before the other one."""
         with self.device.timer("what moves: compare"):
-            given, lens = self._given(one, other, spline), _lens(one)
+            return self._free(one, other, self._given(one, other, spline))
+
+    def seen_from(
+        self, one: Reference | DepthImage, other: Reference | DepthImage, values: Any, spline: Spline
+    ) -> SeenFrom:
+        """One image seen from the other. values: on the device, as `intensity` gives them at the keyframe's grid: of
+        `one` if that is a keyframe, else of `other`."""
+        e, lens = self.device.e, _lens(one)
+        with self.device.timer("what moves: compare"):
+            given = self._given(one, other, spline)
+            near = self._free(one, other, given)
             has_rays = isinstance(one, DepthImage) or one.rolling is not None
-            kernel = self.kernel(free_space_kernel, lens, _lens(other), grid_of(lens)[1], has_rays)
-            return Look(self, one, _lens(other), given, has_rays, kernel(given))
+            kernel = self._kernel(meeting_kernel, lens, _lens(other), grid_of(lens)[1], has_rays)
+            apart, handed = kernel(MeetingInput(**vars(given), values=values))
+            off, value = (e.download(each, grid_shape(lens)) for each in (apart, handed))
+            own = value if isinstance(one, DepthImage) else e.download(values, grid_shape(lens))
+            return SeenFrom(near.z, near.free, _known(off), _known(own), value > 1.5 * _UNKNOWN)
 
     def intensity(self, ref: Reference, color: ColorImage | None, brightness: FloatArray, spline: Spline) -> Any:
         """A colour image's intensities less those expected at the keyframe's grid, on the device; without one unknown.
@@ -209,9 +225,9 @@ class FreeSpace:
         e, (level, stride) = self.device.e, grid_of(ref.lens)
         with self.device.timer("what moves: compare"):
             if color is None or not ref.points:
-                return e.upload(np.full(grid_shape(ref.lens), np.nan))
+                return e.upload(np.full(grid_shape(ref.lens), _UNKNOWN))
             points, own_level = ref.points[level], color.level(pyramid_level(level))
-            kernel = self.kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
+            kernel = self._kernel(intensity_kernel, color.exposure.lens, ref.lens, stride, own_level)
             seen_at = to_base(e, spline, ref.T_world_base, ref.rolling)
             seen_from = from_base(e, spline, ref.T_world_base, color.exposure)
             given = points.x, points.y, points.z, points.intensity, seen_at, color.levels[own_level], seen_from
@@ -228,35 +244,12 @@ class FreeSpace:
         poses = to_base(e, spline, T, moved), from_base(e, spline, T, seen)
         return SpaceInput(rho, *self.device.device_rays, poses[0], there, poses[1])
 
-
-@dataclass
-class Look:
-    """One image seen from another, which may still be under way on the device."""
-
-    space: FreeSpace
-    one: Reference | DepthImage
-    there: Lens
-    given: SpaceInput
-    has_rays: bool
-    found: Any
-
-    @cached_property
-    def near(self) -> Free:
-        """What stands in free space."""
-        e = self.space.device.e
-        with self.space.device.timer("what moves: compare"):
-            return Free(*(e.download(values, grid_shape(_lens(self.one))) for values in self.found))
-
-    def closer(self, values: Any) -> SeenFrom:
-        """All of it. values: on the device, as `FreeSpace.intensity` gives them at the keyframe's grid: of the image
-        itself if that is a keyframe, else of the other one."""
-        e, lens, near = self.space.device.e, _lens(self.one), self.near
-        with self.space.device.timer("what moves: compare"):
-            kernel = self.space.kernel(meeting_kernel, lens, self.there, grid_of(lens)[1], self.has_rays)
-            met = kernel(MeetingInput(**vars(self.given), values=values))
-            apart, handed, inside = (e.download(each, grid_shape(lens)) for each in met)
-            own = handed if isinstance(self.one, DepthImage) else e.download(values, grid_shape(lens))
-            return SeenFrom(near.z, near.free, apart, own, inside == 0.0)
+    def _free(self, one: Reference | DepthImage, other: Reference | DepthImage, given: SpaceInput) -> Free:
+        lens, has_rays = _lens(one), isinstance(one, DepthImage) or one.rolling is not None
+        kernel = self._kernel(free_space_kernel, lens, _lens(other), grid_of(lens)[1], has_rays)
+        rho, free = (self.device.e.download(values, grid_shape(lens)) for values in kernel(given))
+        z = np.divide(np.float32(1.0), rho, out=np.full_like(rho, np.nan), where=rho > 0)
+        return Free(z, _known(free))
 
 
 def _lens(image: Reference | DepthImage) -> Lens:
@@ -277,3 +270,7 @@ def grid_shape(lens: Lens) -> tuple[int, int]:
     """Rows and columns of that grid."""
     _, stride = grid_of(lens)
     return -(-lens.camera.height // stride), -(-lens.camera.width // stride)
+
+
+def _known(values: Grid) -> Grid:
+    return np.where(values < 0.5 * _UNKNOWN, values, np.float32(np.nan))

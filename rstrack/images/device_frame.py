@@ -31,6 +31,7 @@ from rstrack.images.pyramid import (
     depth_resolution,
     lens_sees,
     octaves_finer,
+    thumbnail,
 )
 from rstrack.options import Options
 
@@ -111,13 +112,13 @@ class DeviceRig:
             z = _checked(frame.depth, rig.depth_camera, "depth", (), "float metres, 0 = missing", np.floating)
             if self.resolution == 0.0 and index < _SETTLED:
                 self.resolution = depth_resolution(z)
-            exposure = self.depth_exposure(frame.depth)
-            depth = depth_image(self.e, exposure, z, options.max_depth, self.resolution, self.sees)
+            z = np.where(self.sees, z, 0.0)
+            depth = depth_image(self.e, self.depth_exposure(frame.depth), z, options.max_depth, self.resolution)
             colors = []
             for image in frame.colors if options.photometric else ():
                 pixels = _checked(image, rig.color_camera, "colour", (3,), "uint8 RGB", np.uint8)
-                taken = self.color_exposure(replace(image, stamp=image.stamp + color_late_s))
-                colors.append(color_image(self.e, taken, pixels, self._finer, self._evening))
+                exposure = self.color_exposure(replace(image, stamp=image.stamp + color_late_s))
+                colors.append(color_image(self.e, exposure, pixels, self._finer, self._evening))
             return DeviceFrame(index, frame.depth.stamp, depth, tuple(colors), depth.count / z.size, color_late_s)
 
     def depth_exposure(self, image: Image) -> Exposure:
@@ -172,10 +173,10 @@ def without_pixels(e: Engine, depth: DepthImage, mask: Mask, stride: int) -> Dep
     z, inverse_z = depth.z * keep, depth.inverse_z * keep
     dr.eval(z, inverse_z)
     rest, all_ = e.download(inverse_z, shape), e.download(whole.inverse_z, shape)
-    screen = replace(whole, z=e.upload(_widened(all_ - rest, all_)))
+    screen = replace(whole, z=e.upload(_widened(np.where(rest > 0, np.float32(0.0), all_), all_)))
     left_out = mask if depth.left_out is None else mask | depth.left_out
     return replace(
-        depth, z=z, inverse_z=inverse_z, count=cv2.countNonZero(rest), whole=whole, screen=screen,
+        depth, z=z, inverse_z=inverse_z, count=int(np.count_nonzero(rest)), whole=whole, screen=screen,
         left_out=left_out, left_out_stride=stride,
     )  # fmt: skip
 
@@ -183,6 +184,9 @@ def without_pixels(e: Engine, depth: DepthImage, mask: Mask, stride: int) -> Dep
 def frame_without(e: Engine, frame: DeviceFrame, mask: Mask, stride: int) -> DeviceFrame:
     """A frame whose depth, and whose thumbnails, do without the pixels of a mask (gh, gw); see `without_pixels`."""
     depth = without_pixels(e, frame.depth, mask, stride)
+    camera = depth.exposure.lens.camera
+    rho = e.download(depth.inverse_z, (camera.height, camera.width))
+    depth = replace(depth, thumbnail=thumbnail(rho, rho > 0))
     colors = tuple(replace(color, thumbnail=thumbnail_without(color, depth)) for color in frame.colors)
     return replace(frame, depth=depth, colors=colors)
 
@@ -211,4 +215,4 @@ def _widened(moving: npt.NDArray[np.float32], whole: npt.NDArray[np.float32]) ->
     """z (h, w), m, of what hides points: 1/z of what moves (h, w), and as far beside it as colours may show it."""
     margin = 2 * round(MARGIN * whole.shape[1]) + 1
     rho = np.maximum(whole, cv2.dilate(moving, np.ones((margin, margin), np.uint8)))
-    return ((rho > 0) / np.maximum(rho, np.finfo(np.float32).tiny)).astype(np.float32, copy=False)
+    return np.divide(np.float32(1.0), rho, out=np.zeros_like(rho), where=rho > 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import cv2
@@ -14,7 +13,6 @@ import numpy.typing as npt
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
 from rsgen.geometry.camera import Camera
-from rstrack.compiled import compiled
 from rstrack.images.line_poses import Exposure
 
 LEVELS = 3
@@ -31,7 +29,8 @@ _THUMBNAIL = 20, 15
 class DepthImage:
     """A depth image: z (m, 0 missing) and 1/z on the device; rays are those of its camera.
 
-    count: pixels that have depth. resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
+    count: pixels that have depth. thumbnail (15, 20): of 1/z, 0 missing.
+    resolution: the camera's step (1/m, see `depth_resolution`), 0 where it shows none.
     whole: the image before what moves by itself was left out of it; None where nothing was. screen: that one with what
     moves made wider. left_out (gh, gw): every so-manyth pixel and row (left_out_stride) that was, None likewise.
     """
@@ -40,17 +39,12 @@ class DepthImage:
     z: Any
     inverse_z: Any
     count: int
+    thumbnail: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(_THUMBNAIL[::-1], np.float32))
     resolution: float = 0.0
     whole: DepthImage | None = None
     screen: DepthImage | None = None
     left_out: npt.NDArray[np.bool_] | None = None
     left_out_stride: int = 1
-
-    @cached_property
-    def thumbnail(self) -> npt.NDArray[np.float32]:
-        """(15, 20): of 1/z, 0 missing."""
-        camera = self.exposure.lens.camera
-        return thumbnail_of_known(np.array(self.inverse_z.numpy()).reshape(camera.height, camera.width))
 
     @property
     def occluder(self) -> DepthImage:
@@ -94,30 +88,16 @@ def octaves_finer(color: Camera, depth: Camera) -> int:
 
 
 def depth_image(
-    e: Engine, exposure: Exposure, z: npt.NDArray[Any], max_depth: float, resolution: float = 0.0,
-    sees: npt.NDArray[np.bool_] | None = None,
-) -> DepthImage:  # fmt: skip
-    """z (h, w) in metres; what is not finite, not positive or beyond max_depth counts as missing, and what the lens
-    does not see (h, w)."""
-    z = np.ascontiguousarray(z, np.float32).reshape(-1)
-    seen = np.ones(z.shape, bool) if sees is None else sees.reshape(-1)
-    cleaned, inverse, count = _cleaned(z, seen, np.float32(min(max_depth, float(np.finfo(np.float32).max))))
-    return DepthImage(exposure, e.upload(cleaned), e.upload(inverse), count, resolution)
-
-
-@compiled
-def _cleaned(
-    z: npt.NDArray[np.float32], sees: npt.NDArray[np.bool_], most: np.float32
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], int]:
-    """z (n,), 1/z, both 0 where that is missing, and how many are not: in one pass, a tenth of what NumPy's take."""
-    cleaned, inverse, count = np.empty_like(z), np.empty_like(z), 0
-    for i in range(z.size):
-        good = sees[i] & (z[i] > 0.0) & (z[i] < most)
-        value = z[i] if good else np.float32(np.inf)
-        inverse[i] = np.float32(1.0) / value
-        cleaned[i] = value if good else np.float32(0.0)
-        count += good
-    return cleaned, inverse, count
+    e: Engine, exposure: Exposure, z: npt.NDArray[Any], max_depth: float, resolution: float = 0.0
+) -> DepthImage:
+    """z (h, w) in metres; what is not finite, not positive or beyond max_depth counts as missing."""
+    z = np.asarray(z, np.float32)
+    good = (z > 0.0) & (z < max_depth)
+    z = np.where(good, z, np.float32(0.0))
+    inverse = np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=good)
+    return DepthImage(
+        exposure, e.upload(z), e.upload(inverse), int(np.count_nonzero(good)), thumbnail(inverse, good), resolution
+    )
 
 
 def depth_resolution(z: npt.NDArray[Any]) -> float:
@@ -136,15 +116,13 @@ def depth_resolution(z: npt.NDArray[Any]) -> float:
     return float(steps[order][np.searchsorted(seen, 0.5 * seen[-1])])
 
 
-def thumbnail(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """An image (h, w) in 15 rows of 20, to be recognised by."""
-    return np.asarray(cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA))
-
-
-def thumbnail_of_known(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """The same of one with holes (h, w; positive, 0 missing); 0 where less than half of it is known."""
-    share = thumbnail(np.asarray(cv2.threshold(image, 0.0, 1.0, cv2.THRESH_BINARY)[1]))
-    return np.where(share > 0.5, thumbnail(image) / np.maximum(share, np.float32(1e-3)), np.float32(0.0))
+def thumbnail(image: npt.NDArray[np.float32], known: npt.NDArray[np.bool_] | None = None) -> npt.NDArray[np.float32]:
+    """An image (h, w) in 15 rows of 20, to be recognised by; 0 where less than half of it is known."""
+    if known is None:
+        return np.asarray(cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA))
+    share = np.asarray(cv2.resize(known.astype(np.float32), _THUMBNAIL, interpolation=cv2.INTER_AREA))
+    mean = np.asarray(cv2.resize(np.where(known, image, np.float32(0.0)), _THUMBNAIL, interpolation=cv2.INTER_AREA))
+    return np.where(share > 0.5, mean / np.maximum(share, np.float32(1e-3)), np.float32(0.0)).astype(np.float32)
 
 
 def intensity(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
@@ -172,10 +150,8 @@ def color_image(
     levels = pyramid(grey if evening is None else grey * evening, count)
     masks = _beyond_range(color, count)
     moments = np.array([levels[-1].mean(), levels[-1].std()], np.float64)
-    small = thumbnail(levels[-1])
-    for level, mask in zip(levels, masks, strict=True):
-        np.copyto(level, np.nan, where=mask)
-    return ColorImage(exposure, tuple(e.upload(level) for level in levels), moments, small, finer)
+    shown = (np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True))
+    return ColorImage(exposure, tuple(e.upload(level) for level in shown), moments, thumbnail(levels[-1]), finer)
 
 
 def _beyond_range(color: npt.NDArray[np.uint8], count: int) -> list[npt.NDArray[np.bool_]]:
@@ -208,13 +184,12 @@ def masked_pyramid(
     image: npt.NDArray[np.float32], valid: npt.NDArray[np.bool_]
 ) -> list[tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]]:
     """Pyramid of an image with holes, by normalised convolution; a pixel is valid where half its weight is."""
-    weight, value = valid.astype(np.float32), np.zeros_like(image)
-    np.copyto(value, image, where=valid)
+    weight = valid.astype(np.float32)
+    value = np.where(valid, image, np.float32(0.0))
     out = [(value, valid)]
     for _ in range(LEVELS - 1):
         value, weight = np.asarray(cv2.pyrDown(value)), np.asarray(cv2.pyrDown(weight))
-        mean = (value / np.maximum(weight, np.float32(1e-3))).astype(np.float32, copy=False)
-        out.append((mean, weight > 0.5))
+        out.append((value / np.maximum(weight, np.float32(1e-3)), weight > 0.5))
     return out
 
 

@@ -21,7 +21,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.data.rig import Rig
 from rstrack.images.device_frame import DeviceFrame
-from rstrack.images.pyramid import thumbnail_of_known
+from rstrack.images.pyramid import thumbnail
 from rstrack.keyframes.keyframe import Reference
 
 # Scales of the residuals: of depth as a part of it, of intensity over the image's standard deviation.
@@ -81,7 +81,8 @@ def small_keyframe(ref: Reference) -> SmallKeyframe:
     points = ref.lens.camera.unproject(uv) / rho[rho > 0][:, None]
     if ref.intensity is None:
         return SmallKeyframe(points, np.full(len(points), np.nan))
-    grey = thumbnail_of_known(np.nan_to_num(ref.intensity)).astype(float)[rho > 0]
+    known = np.isfinite(ref.intensity)
+    grey = np.asarray(thumbnail(np.where(known, ref.intensity, np.float32(0.0)), known), float)[rho > 0]
     return SmallKeyframe(points, np.where(grey > 0, grey, np.nan))
 
 

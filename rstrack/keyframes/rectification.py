@@ -15,10 +15,7 @@ import drjit as dr
 from rsgen.device.arrays import Engine, recorded, recorded_from
 from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, gather, move, project, project_rolling
-from rsgen.geometry.camera import Camera
 from rstrack.images.sampling import (
-    EDGE,
-    bilinear,
     bilinear_value,
     depth_of,
     grid,
@@ -29,119 +26,36 @@ from rstrack.images.sampling import (
     surface,
 )
 
-# Each step shrinks the error by the picture's stretching, a few per cent. Rounds at most, and steps of each: for these
-# the pose and the ray found at its beginning are followed along a straight line.
-_ROUNDS, _STEPS = 3, 2
-# Pixels: a fixed point that has not settled lies at an occlusion; another round changes depth that is so near by less
-# than a hundredth of a millimetre.
-_SETTLED, _EXACT = 0.02, 1e-3
-# Pixels that a step goes at most.
-_STRIDE = 40.0
+# Each iteration shrinks the error by the picture's stretching, a few per cent.
+ITERATIONS = 6
+# Pixels: a fixed point that has not settled lies at an occlusion.
+_SETTLED = 0.02
 
 
-@dataclass(frozen=True)
-class _Line:
-    """Poses T_base_cam at an image's lines: at line `low` and, line by line, from there on."""
-
-    M: list[Any]
-    change: list[Any]
-    low: Any
-
-    @classmethod
-    def at(cls, e: Engine, lens: Lens, to_base: Any, x: Any, y: Any) -> _Line:
-        """Those about a pixel."""
-        if lens.lines == 1:
-            return cls(gather(to_base, e.UInt(0), TO_BASE, stride=TO_BASE), [], e.Float(0.0))
-        line = dr.clip(lens.line_of(x, y), 0.0, lens.lines - 1.0)
-        low = e.UInt(e.Int(dr.minimum(dr.floor(line), lens.lines - 2.0)))
-        before, after = (gather(to_base, at, TO_BASE, stride=TO_BASE) for at in (low, low + 1))
-        return cls(before, [b - a for a, b in zip(before, after, strict=True)], e.Float(low))
-
-    def pose(self, lens: Lens, x: Any, y: Any) -> list[Any]:
-        """T_base_cam at a pixel's own time, between the lines' poses."""
-        part = lens.line_of(x, y) - self.low
-        return [dr.fma(part, d, m) for m, d in zip(self.M, self.change, strict=True)] if self.change else self.M
+def _ray(e: Engine, lens: Lens, rays: tuple[Any, Any], x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+    camera = lens.camera
+    if camera.model == "pinhole":
+        return (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+    xn, yn = (bilinear_value(e, table, camera.width, camera.height, x, y, active)[0] for table in rays)
+    return xn, yn
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Normalised coordinates about a pixel, bilinear: in the cell of pixels that it lies in, and from there on."""
-
-    lens: Lens
-    cells: list[Any]
-    corner: tuple[Any, Any]
-
-    @classmethod
-    def at(cls, e: Engine, lens: Lens, rays: tuple[Any, ...], x: Any, y: Any) -> _Rays:
-        camera = lens.camera
-        if camera.model == "pinhole":
-            return cls(lens, [], (0.0, 0.0))
-        cells = [bilinear(e, table, camera.width, camera.height, x, y, e.Bool(True))[:4] for table in rays]
-        return cls(lens, cells, (dr.floor(x), dr.floor(y)))
-
-    def of(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """Those of a pixel."""
-        if not self.cells:
-            camera = self.lens.camera
-            return (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
-        u, v = x - self.corner[0], y - self.corner[1]
-        xn, yn = (dr.lerp(dr.lerp(a, b, u), dr.lerp(c, d, u), v) for a, b, c, d in self.cells)
-        return xn, yn
+def _pose(e: Engine, lens: Lens, to_base: Any, x: Any, y: Any) -> list[Any]:
+    """T_base_cam at a pixel's own time, between the lines' poses."""
+    if lens.lines == 1:
+        return gather(to_base, e.UInt(0), TO_BASE, stride=TO_BASE)
+    line = dr.clip(lens.line_of(x, y), 0.0, lens.lines - 1.0)
+    low = e.UInt(e.Int(dr.minimum(dr.floor(line), lens.lines - 2.0)))
+    part = line - e.Float(low)
+    before, after = gather(to_base, low, TO_BASE, stride=TO_BASE), gather(to_base, low + 1, TO_BASE, stride=TO_BASE)
+    return [dr.lerp(one, other, part) for one, other in zip(before, after, strict=True)]
 
 
-def _found(
-    e: Engine, lens: Lens, base: Lens, rho: Any, rays: tuple[Any, ...], to_base: Any, wanted: Any
-) -> tuple[Any, Any, Any]:  # fmt: skip
-    """Inverse depth of the base image's wanted pixels, 0 where the source shows nothing, and the source's pixels."""
-    camera, source = base.camera, lens.camera
-    _, px, py = grid(e, camera.width, camera.height, 1)
-    goal = e.Float(px), e.Float(py)
-    still = _Line.at(e, lens, to_base, *goal) if lens.lines == 1 else None
-
-    def round_(count: Any, x: Any, y: Any, value: Any, miss: Any) -> tuple[Any, ...]:
-        x, y = _inside(source, x, y)
-        line = still or _Line.at(e, lens, to_base, x, y)
-        ray = _Rays.at(e, lens, rays, x, y)
-        for _ in range(_STEPS):
-            x, y = _inside(source, x, y)
-            value, active = surface(e, source, rho, x, y, e.Bool(True))
-            # Where there is no depth the last guess is as good as any; it may move back onto the surface.
-            z = dr.rcp(dr.select(active, value, 1.0))
-            rx, ry = ray.of(x, y)
-            at = project(camera, move(line.pose(lens, x, y), (rx * z, ry * z, z)))
-            dx, dy = goal[0] - at.x, goal[1] - at.y
-            miss = dr.maximum(dr.abs(dx), dr.abs(dy))
-            active &= at.valid & (miss < _SETTLED)
-            value = dr.select(active, dr.rcp(at.q[2]), 0.0)
-            ok = at.valid & dr.isfinite(dx + dy)
-            if source.model != "pinhole":
-                # A fisheye's pixels are up to twice as wide as the keyframe's: the step would overshoot and swing.
-                dx, dy = project(source, (rx, ry, e.Float(1.0))).jvp((dx / camera.fx, dy / camera.fy, 0.0))
-            x = dr.select(ok, x + dr.clip(dx, -_STRIDE, _STRIDE), x)
-            y = dr.select(ok, y + dr.clip(dy, -_STRIDE, _STRIDE), y)
-        return count + 1, x, y, value, miss
-
-    _, x, y, value, _ = dr.while_loop(
-        (e.UInt(0), *_first_guess(lens, base, *goal), e.Float(0.0), e.Float(dr.inf)),
-        lambda count, x, y, value, miss: wanted & (count < _ROUNDS) & (miss > _EXACT),
-        round_,
-    )
-    return value, x, y
-
-
-def _inside(camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
-    return dr.clip(x, 0.0, camera.width - 1.001), dr.clip(y, 0.0, camera.height - 1.001)
-
-
-def _first_guess(lens: Lens, base: Lens, x: Any, y: Any) -> tuple[Any, Any]:
-    """Where a source that stood still would show the keyframe's pixel (x, y).
-
-    An older keyframe is not turned to where it looks first: filled with all that it shows then, and not with what lies
-    within some steps' reach, keyframes of a drone's flight gave errors an eighth larger.
-    """
+def _first_guess(e: Engine, lens: Lens, base: Lens, x: Any, y: Any) -> tuple[Any, Any]:
+    """Where a source that stood still would show the keyframe's pixel (x, y)."""
     if lens.camera.model == "pinhole":
-        return x, y
-    ray = (x - base.camera.cx) / base.camera.fx, (y - base.camera.cy) / base.camera.fy, type(x)(1.0)
+        return e.Float(x), e.Float(y)
+    ray = (x - base.camera.cx) / base.camera.fx, (y - base.camera.cy) / base.camera.fy, e.Float(1.0)
     at = project(lens.camera, ray)
     return dr.select(at.valid, at.x, x), dr.select(at.valid, at.y, y)
 
@@ -151,17 +65,32 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
 
     0 where the source shows nothing. `base` is a global-shutter pinhole.
     """
-    return recorded(lambda rho, x, y, to_base: _found(e, lens, base, rho, (x, y), to_base, e.Bool(True)))
-
-
-def resting_kernel(e: Engine, lens: Lens) -> Callable[..., Any]:
-    """Kernel (inverse depth in a base image, source x, y, the source's inverse depth without what moves) → the first,
-    0 where what moves was taken from the source."""
+    camera = base.camera
 
     @recorded
-    def kernel(rho: Any, x: Any, y: Any, resting: Any) -> Any:
-        _, rests = surface(e, lens.camera, resting, x, y, rho > 0.0)
-        return dr.select(rests, rho, 0.0)
+    def kernel(rho: Any, rays_x: Any, rays_y: Any, to_base: Any) -> Any:
+        _, px, py = grid(e, camera.width, camera.height, 1)
+        goal_x, goal_y = e.Float(px), e.Float(py)
+        x, y = _first_guess(e, lens, base, goal_x, goal_y)
+        width, height = lens.camera.width, lens.camera.height
+        value, active, miss = e.Float(0.0), e.Bool(True), e.Float(0.0)
+        for _ in range(ITERATIONS):
+            x, y = dr.clip(x, 0.0, width - 1.001), dr.clip(y, 0.0, height - 1.001)
+            value, active = surface(e, lens.camera, rho, x, y, e.Bool(True))
+            # Where there is no depth the last guess is as good as any; it may move back onto the surface.
+            z = dr.rcp(dr.select(active, value, 1.0))
+            rx, ry = _ray(e, lens, (rays_x, rays_y), x, y, e.Bool(True))
+            at = project(camera, move(_pose(e, lens, to_base, x, y), (rx * z, ry * z, z)))
+            dx, dy = goal_x - at.x, goal_y - at.y
+            miss = dr.maximum(dr.abs(dx), dr.abs(dy))
+            value = dr.rcp(at.q[2])
+            active &= at.valid & (miss < _SETTLED)
+            ok = at.valid & dr.isfinite(dx + dy)
+            if lens.camera.model != "pinhole":
+                # A fisheye's pixels are up to twice as wide as the keyframe's: the step would overshoot and swing.
+                dx, dy = project(lens.camera, (rx, ry, e.Float(1.0))).jvp((dx / camera.fx, dy / camera.fy, 0.0))
+            x, y = dr.select(ok, x + dr.clip(dx, -40.0, 40.0), x), dr.select(ok, y + dr.clip(dy, -40.0, 40.0), y)
+        return dr.select(active, value, 0.0), x, y
 
     return kernel
 
@@ -180,8 +109,8 @@ class ColorInput:
 
 
 def color_kernel(e: Engine, lens: Lens, base: Lens, level: int = 0) -> Callable[[ColorInput], Any]:
-    """Kernel → intensity at the pixels of the reference `base`, NaN where unknown, looked up by equation (3) in the
-    image's pyramid at `level`."""
+    """Kernel → (intensity, valid 0/1) at the pixels of the reference `base`, looked up by equation (3) in the image's
+    pyramid at `level`."""
     width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
     shrink = 0.5**level
 
@@ -193,7 +122,8 @@ def color_kernel(e: Engine, lens: Lens, base: Lens, level: int = 0) -> Callable[
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         u, v = seen.x * shrink, seen.y * shrink
         value, active = bilinear_value(e, given.image, width, height, u, v, active & seen.valid)
-        return dr.select(active, value, dr.nan)  # NaN also where clipped
+        active &= dr.isfinite(value)  # not clipped
+        return dr.select(active, value, 0.0), dr.select(active, e.Float(1.0), 0.0)
 
     return kernel
 
@@ -245,51 +175,5 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[FusionInput], An
         active &= w > 0.0
         share = dr.select(active, w / (weight + w), 0.0)
         return dr.fma(share, dr.rcp(fused_z) - rho, rho), dr.minimum(weight + dr.select(active, w, 0.0), limit)
-
-    return kernel
-
-
-@dataclass(frozen=True)
-class InheritedInput:
-    """Device arrays: the keyframe's inverse depth and weight; the older one's inverse depth; T_new_older as `TO_BASE`
-    floats."""
-
-    inverse_depth: Any
-    weight: Any
-    older: Any
-    to_base: Any
-
-
-@dataclass(frozen=True)
-class HiddenInput(InheritedInput):
-    """The same, and where something moves before the keyframe (above 0), the older one's intensities, and the factor
-    and offset that make them the newer one's."""
-
-    hidden: Any
-    intensity: Any
-    as_now: Any
-
-
-def inherit_kernel(e: Engine, older: Lens, base: Lens, moves: bool) -> Callable[[Any], Any]:
-    """Kernel → (inverse depth, weight, intensity): holes filled with what an older keyframe shows there, with weight 1.
-
-    moves: takes a `HiddenInput`; intensities are those where something moves, NaN elsewhere and where they are not
-    known. Without it there are none.
-    """
-    width, height = older.camera.width, older.camera.height
-
-    @recorded_from(HiddenInput if moves else InheritedInput)
-    def kernel(given: Any) -> Any:
-        hole = given.inverse_depth <= 0.0
-        wanted = hole | (given.hidden > 0.0) if moves else hole
-        old, x, y = _found(e, older, base, given.older, (), given.to_base, wanted)
-        filled = hole & (old > 0.0)
-        rho, weight = dr.select(filled, old, given.inverse_depth), dr.select(filled, 1.0, given.weight)
-        if not moves:
-            return rho, weight
-        same = wanted & (old > 0.0) & (dr.abs(old - rho) < EDGE * rho)
-        value, same = bilinear_value(e, given.intensity, width, height, x, y, same)
-        factor, offset = (dr.gather(e.Float, given.as_now, e.UInt(i)) for i in (0, 1))
-        return rho, weight, dr.select(same, dr.fma(factor, value, offset), dr.nan)
 
     return kernel

@@ -198,4 +198,4 @@ class SurfaceModel:
         mean = frame + worth / np.maximum(weight + worth, 1e-6) * (model - frame)
         rho = np.where(agree, mean, np.where(frame > 0, frame, model)).astype(np.float32)
         weight = np.where(agree, np.minimum(weight + worth, _MOST), np.where(frame > 0, weight, rho > 0))
-        return self._maker.with_depth(made, depth, colors, spline, e.upload(rho), e.upload(weight))
+        return self._maker.with_depth(made, depth, colors, spline, rho, weight)

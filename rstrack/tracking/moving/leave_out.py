@@ -17,11 +17,10 @@ import numpy as np
 from rsgen.device.arrays import Engine
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import SAME
-from rstrack.alignment.free_space import Free, FreeSpace, Grid, Look, SeenFrom, grid_of
+from rstrack.alignment.free_space import Free, FreeSpace, Grid, SeenFrom, grid_of
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH
-from rstrack.compiled import compiled
 from rstrack.data.moving_masks import Mask
 from rstrack.images.device_frame import full_size, without_pixels
 from rstrack.images.pyramid import DepthImage
@@ -50,13 +49,13 @@ def moving(seen: SeenFrom, sigma_depth: float, median_depth: float, sigma_intens
     sigma_depth (m): scale of depth's residuals at median_depth (m), growing with the square of depth; sigma_intensity:
     that of intensity's. Nothing where too little stands in free space to tell.
     """
-    far = _in_free_space(seen.free, seen.z, sigma_depth, median_depth)
+    scale, least = _scales(seen.z, sigma_depth, median_depth)
+    far = np.nan_to_num(seen.free) > least
     seeds = _opened(far)
     if not _is_enough(seeds):
         return np.zeros_like(seeds)
-    scale, least = _scales(seen.z, sigma_depth, median_depth)
     # Behind what is seen there nothing is known.
-    hidden = seen.apart < -least
+    hidden = np.nan_to_num(seen.apart) < -least
     depth = (np.where(hidden, np.nan, seen.apart) / scale).astype(np.float32)
     odd = far | _at_odds(depth, seen.intensity, sigma_intensity)
     grown = _grown(seeds, odd, hidden | ~np.isfinite(seen.apart), hidden | seen.outside, seen.z)
@@ -65,7 +64,8 @@ def moving(seen: SeenFrom, sigma_depth: float, median_depth: float, sigma_intens
 
 def anything(near: Free, sigma_depth: float, median_depth: float) -> bool:
     """Whether enough stands in free space for `moving` to find something."""
-    return _is_enough(_opened(_in_free_space(near.free, near.z, sigma_depth, median_depth)))
+    _, least = _scales(near.z, sigma_depth, median_depth)
+    return _is_enough(_opened(np.nan_to_num(near.free) > least))
 
 
 def _is_enough(seeds: Mask) -> bool:
@@ -92,18 +92,11 @@ def moving_with(seen: SeenFrom, left_out: Mask, sigma_depth: float, median_depth
     return _widened(grown) if seeds.any() else nowhere
 
 
-@compiled
 def _scales(z: Grid, sigma_depth: float, median_depth: float) -> tuple[Grid, Grid]:
     """σ (m) at depths z, and how far before what was seen something has to stand to be in free space."""
-    share = z / np.float32(median_depth)
-    scale = np.maximum(np.float32(sigma_depth) * share * share, np.float32(1e-6))
-    return scale, np.maximum(np.float32(_BEFORE_M) + np.float32(EDGE) * z, np.float32(_BEFORE_SIGMAS) * scale)
-
-
-@compiled
-def _in_free_space(seen: Grid, z: Grid, sigma_depth: float, median_depth: float) -> Mask:
-    """Pixels (gh, gw) at depths z that stand so far (`seen`, m) before what was seen there."""
-    return np.asarray(seen > _scales(z, sigma_depth, median_depth)[1])
+    z = np.nan_to_num(z)
+    scale = np.maximum(sigma_depth * np.square(z / np.float32(median_depth)), 1e-6)
+    return scale.astype(np.float32), np.maximum(_BEFORE_M + EDGE * z, _BEFORE_SIGMAS * scale)
 
 
 def _opened(mask: Mask) -> Mask:
@@ -218,22 +211,23 @@ def _found(
     def differences() -> Any:
         return space.intensity(ref, image, brightness, state.spline)
 
-    of_ref, of_frame = space.look(ref, depth.occluder, state.spline), space.look(depth.occluder, ref, state.spline)
-    gone = _moving(space, of_ref, scales, sigma_intensity, differences)
+    gone = _moving(space, space.before(ref, depth.occluder, state.spline), scales, sigma_intensity,
+                   lambda: space.seen_from(ref, depth.occluder, differences(), state.spline))  # fmt: skip
     if gone is None:
         return nothing
-    if gone.any():
-        # What falls where something is gone may be that in another place.
-        of_frame = space.look(depth.occluder, without(e, ref, gone), state.spline)
-    came = _moving(space, of_frame, scales, sigma_intensity, differences)
+    # What falls where something is gone may be that in another place.
+    rest = without(e, ref, gone) if gone.any() else ref
+
+    def look() -> SeenFrom:
+        return space.seen_from(depth.occluder, rest, differences(), state.spline)
+
+    came = _moving(space, space.before(depth.occluder, rest, state.spline), scales, sigma_intensity, look)
     if came is None:
         return nothing
     if color is None and before is not None and before.left_out is not None:
         # Without colours only its place tells, in the keyframe's holes, what was left out of the frame before. That
         # creeps over what rests beside it; with colours it costs more than it gains.
-        came = came | (
-            unseen(of_frame.closer(differences()), *scales) & _as_before(space, depth, before, state.spline, scales)
-        )
+        came = came | (unseen(look(), *scales) & _as_before(space, depth, before, state.spline, scales))
     return LeftOut(
         without_pixels(e, depth, came, grid_of(depth.exposure.lens)[1]) if came.any() else depth,
         gone if gone.any() else None,
@@ -241,17 +235,16 @@ def _found(
 
 
 def _moving(
-    space: FreeSpace, look: Look, scales: tuple[float, float], sigma_intensity: float, differences: Callable[[], Any]
+    space: FreeSpace, near: Free, scales: tuple[float, float], sigma_intensity: float, look: Callable[[], SeenFrom]
 ) -> Mask | None:
-    """Pixels of what moves, None where so much seems to that the pose is wrong.
+    """Pixels of what moves, None where so much seems to that the pose is wrong. look: closer, where something may move.
 
-    scales (m): as `moving` takes them; differences: of intensities, asked for where something may move.
+    scales (m): as `moving` takes them.
     """
-    near = look.near
     with space.device.timer("what moves: regions"):
         if not anything(near, *scales):
             return np.zeros(near.z.shape, bool)
-    seen = look.closer(differences())
+    seen = look()
     with space.device.timer("what moves: regions"):
         found = moving(seen, *scales, sigma_intensity)
     return None if _share(found, seen) > _MOST else found
@@ -263,7 +256,7 @@ def _as_before(
     """Pixels (gh, gw) of a frame that show, at about the same place, what has been left out of another one."""
     assert other.left_out is not None
     left_out = space.device.e.upload(other.left_out.astype(np.float32))
-    seen = space.look(depth.occluder, other.occluder, spline).closer(left_out)
+    seen = space.seen_from(depth.occluder, other.occluder, left_out, spline)
     with space.device.timer("what moves: regions"):
         return moving_with(seen, np.nan_to_num(seen.intensity) > 0.5, *scales)
 

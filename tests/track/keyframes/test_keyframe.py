@@ -17,8 +17,13 @@ from rsgen.geometry.shutter import Shutter
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import LEVELS, depth_image, depth_resolution, intensity, masked_pyramid
 from rstrack.images.sampling import EDGE
-from rstrack.keyframes.keyframe import level_points, strides
-from rstrack.keyframes.surface import on_one_surface, surface_roughness, surface_slopes
+from rstrack.keyframes.keyframe import (
+    level_points,
+    on_one_surface,
+    strides,
+    surface_roughness,
+    surface_slopes,
+)
 
 SHAPE = (120, 160)
 
@@ -160,18 +165,6 @@ def test_images_as_the_kernels_take_them() -> None:
     assert depth.count == 2
     np.testing.assert_allclose(download(depth.z, (2, 3)), [[0.5, 0, 0], [0, 0, 4.0]])
     np.testing.assert_allclose(download(depth.inverse_z, (2, 3)), [[2.0, 0, 0], [0, 0, 0.25]])
-    # The same of many pixels, some of which the lens does not see, as whole arrays have it.
-    rng = np.random.default_rng(4)
-    z = rng.uniform(-1.0, 8.0, (24, 32)).astype(np.float32)
-    z[rng.random(z.shape) < 0.2] = np.nan
-    sees = rng.random(z.shape) < 0.9
-    large = Exposure(Lens(Camera(32, 24, 30.0, 30.0, 15.5, 11.5), Shutter()), 0.0, np.eye(4))
-    depth = depth_image(ENGINE, large, z, 6.0, sees=sees)
-    good = sees & (np.nan_to_num(z) > 0) & (np.nan_to_num(z) < 6.0)
-    assert depth.count == np.count_nonzero(good)
-    np.testing.assert_array_equal(depth.z.numpy(), np.where(good, z, np.float32(0.0)).ravel())
-    want = np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=good)
-    np.testing.assert_array_equal(depth.inverse_z.numpy(), want.ravel())
     for colour, grey in (((255, 0, 0), 0.299), ((0, 255, 0), 0.587), ((0, 0, 255), 0.114), ((255, 255, 255), 1.0)):
         np.testing.assert_allclose(intensity(np.full((4, 5, 3), colour, np.uint8)), grey, atol=2.1e-3)
     # The slight blur keeps the sum.

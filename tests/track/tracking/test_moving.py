@@ -60,8 +60,8 @@ def test_free_space_is_what_rays_say(ref_scan: Literal["top-bottom"] | None) -> 
     shutter = at.lens.shutter
     space = FreeSpace(DeviceRig(Rig(camera, shutter, camera, shutter, np.eye(4)), Options(backend="llvm")))
     intensity = space.intensity(ref, None, np.zeros(2), truth)
-    in_frame = space.look(ref, depth, truth).closer(intensity)
-    in_ref = space.look(depth, ref, truth).closer(intensity)
+    in_frame = space.seen_from(ref, depth, intensity, truth)
+    in_ref = space.seen_from(depth, ref, intensity, truth)
     for seen, own, other, plane, sign in ((in_ref, at, ref_at, old, 1), (in_frame, ref_at, at, new, -1)):
         uv = camera.pixel_grid()
         T = truth.pose(own.lens.shutter.line_mid_time(own.stamp, own.lens.shutter.line_of_pixel(uv, camera), camera))
@@ -90,11 +90,18 @@ def test_only_every_stride_th_pixel_is_looked_at() -> None:
     space = FreeSpace(DeviceRig(Rig(camera, at.lens.shutter, camera, at.lens.shutter, np.eye(4)), Options("rs-g")))
     assert grid_of(at.lens)[1] == 2
     intensity = space.intensity(ref, None, np.zeros(2), truth)
-    for look, rho in (
-        (space.look(depth, ref, truth), depth.inverse_z),
-        (space.look(ref, depth, truth), ref.inverse_depth),
+    for near, seen, rho in (
+        (
+            space.before(depth, ref, truth),
+            space.seen_from(depth, ref, intensity, truth),
+            depth.inverse_z,
+        ),
+        (
+            space.before(ref, depth, truth),
+            space.seen_from(ref, depth, intensity, truth),
+            ref.inverse_depth,
+        ),
     ):
-        near, seen = look.near, look.closer(intensity)
         picked = space.device.e.download(rho, (240, 320))[::2, ::2]
         np.testing.assert_array_equal(near.z, np.float32(1.0) / picked)
         np.testing.assert_array_equal(seen.z, near.z)
