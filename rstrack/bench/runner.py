@@ -109,7 +109,8 @@ def run_cells(
         progress("cells", min(1.0, (finished_s + under_way_s) / max(to_do_s, 1e-9)), note)
 
     def report(name: str, fraction: float, note: str) -> None:
-        running[name] = fraction
+        # A run's stages begin at 0 each: a cell does not go back for that.
+        running[name] = max(fraction, running.get(name, 0.0))
         show(f"{name} {note}")
 
     try:

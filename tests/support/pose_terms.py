@@ -21,6 +21,7 @@ from rstrack.alignment.linearise import Linearised, Started
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Problem
+from rstrack.alignment.pace import Pace
 from rstrack.alignment.spline_state import SplineState
 
 FOCAL, DEPTH_M = 500.0, 2.0
@@ -41,6 +42,7 @@ class PoseTerms:
     costs: list[float] = field(default_factory=list)
     slopes: list[Spline] = field(default_factory=list)
     visible_asked: int = 0
+    pace: Pace = field(default_factory=Pace)
 
     def timer(self, name: str) -> Any:
         """Nothing is timed."""

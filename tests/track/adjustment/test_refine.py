@@ -63,7 +63,8 @@ def test_refining_makes_a_run_better(run: Path, tmp_path: Path, capsys: pytest.C
     rounds = info["refined"]["rounds"]
     assert len(rounds) <= 3 and rounds[-1]["moved_m"] < rounds[0]["moved_m"]
     # What it was made of lies beside it, the first pose stays, and poses go with the spline.
-    assert (out / "trajectory_online.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
+    # To the digits that are written: a pose read and written again may round its last one otherwise.
+    np.testing.assert_allclose(np.loadtxt(out / "trajectory_online.txt"), np.loadtxt(run / "trajectory.txt"), atol=2e-9)
     before, after = read_estimate(run), read_estimate(out)
     np.testing.assert_allclose(after.T_world_depth[0], before.T_world_depth[0], atol=2e-8)
     assert after.spline is not None

@@ -150,7 +150,10 @@ def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, origina
     where = str((original / "seq").resolve())
     frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES, "color_falloff": 0.0, "camera": None}
     assert info["dataset"] == {"name": "synthetic", "path": where, **frames}
-    assert set(info["versions"]) == {"rstrack", "numpy", "scipy", "drjit"} and info["backend"] in ("llvm", "cuda")
+    assert set(info["versions"]) == {"rstrack", "numpy", "scipy", "numba", "drjit"} and info["backend"] in (
+        "llvm",
+        "cuda",
+    )
     assert (info["end"], info["error"], info["lost"]) == ("done", None, 0) and info["keyframes"] >= 1
     times = info["timings"]
     assert len(times["frame_ms"]) == FRAMES and 0.0 < times["wait_ms"] <= times["p99_wait_ms"]
