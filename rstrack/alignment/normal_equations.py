@@ -184,7 +184,7 @@ def solve(H: FloatArray, g: FloatArray, bandwidth: int = 24, damping: float = 0.
     with np.errstate(over="ignore", invalid="ignore"):
         scale = 1.0 / np.sqrt(np.maximum(H.ravel()[:: size + 1] * (1.0 + damping), 1e-300))
         scaled, right = H * scale[:, None] * scale, scale * g
-    scaled.ravel()[:: size + 1] *= 1.0 + damping
+        scaled.ravel()[:: size + 1] *= 1.0 + damping
     if not (np.isfinite(scaled).all() and np.isfinite(right).all()):
         raise np.linalg.LinAlgError("the normal equations are not finite")
     _, x, failed = scipy.linalg.lapack.dpbsv(
