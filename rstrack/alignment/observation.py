@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,8 +51,13 @@ class _Linearisation:
     brightness: FloatArray | None = None
 
 
-_Now = tuple[Spline, _Linearisation, FloatArray, Quadratic]
-"""A state's spline, a linearisation, what its control points have been moved by since, and its model there."""
+class _Now(NamedTuple):
+    """A state's spline, a linearisation, what its control points moved by since (k, 6), and its model there."""
+
+    spline: Spline
+    linearisation: _Linearisation
+    since: FloatArray
+    model: Quadratic
 
 
 @dataclass
@@ -200,7 +205,7 @@ class Observation:
         """
         now, last = self._now(state), self._last_steady
         if last is None or last[0] is not now or last[1] != self.stands_for:
-            model, exposure = now[3], self.image.exposure
+            model, exposure = now.model, self.image.exposure
             mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
             at = state.spline.t0 + (np.arange(model.first, model.last) - 1) * state.dt
             after = (at - mid) / half if half > 0.0 else np.zeros(len(at))
@@ -218,19 +223,19 @@ class Observation:
 
     def _since(self, state: SplineState) -> FloatArray:
         """What the model's control points have been moved by since (k, 6)."""
-        return self._now(state)[2]
+        return self._now(state).since
 
     def _model(self, state: SplineState) -> Quadratic:
         """That of the linearisation around the current state."""
-        return self._now(state)[3]
+        return self._now(state).model
 
     def _now(self, state: SplineState) -> _Now:
         """The current state as this image has it: asked for several times before the state moves on."""
         now = self._last
-        if now is None or now[0] is not state.spline or now[1] is not self.linearisation:
+        if now is None or now.spline is not state.spline or now.linearisation is not self.linearisation:
             model = self.lin.model
             since = state.received(model.first, model.last) - self.linearisation.at
-            self._last = now = state.spline, self.linearisation, since, model.moved(since)
+            self._last = now = _Now(state.spline, self.linearisation, since, model.moved(since))
         return now
 
 

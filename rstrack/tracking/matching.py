@@ -122,7 +122,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
 def unfinished(solved: Solved, state: SplineState, t: float) -> FloatArray:
     """What may be left of an alignment that was cut, as pose and velocity (12,) at time t (s) in the camera's axes.
 
-    As much as the last step: Gauss-Newton's steps shrink by half or more.
+    Taken for as much as the last step, as if each were half of the one before: nobody knows what was not done.
     """
     T_camera_world = se3.inverse(motion(state.spline, t)[0])
     first, last = state.segment(t), solved.first + len(solved.step)
