@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from rsgen.geometry.shutter import Shutter
     from rsgen.geometry.spline import Spline
     from rsgen.render.sensor import RollingShutterSensor
-    from rsgen.sequence.reader import read_sequence
+    from rsgen.sequence.reader import read_rig, read_sequence
 
-__all__ = ["Camera", "RollingShutterSensor", "Shutter", "Spline", "read_sequence"]
+__all__ = ["Camera", "RollingShutterSensor", "Shutter", "Spline", "read_rig", "read_sequence"]
 
 _HOME = {
     "Camera": "geometry.camera", "RollingShutterSensor": "render.sensor", "Shutter": "geometry.shutter",
-    "Spline": "geometry.spline", "read_sequence": "sequence.reader",
+    "Spline": "geometry.spline", "read_rig": "sequence.reader", "read_sequence": "sequence.reader",
 }  # fmt: skip
 
 

@@ -35,13 +35,13 @@ _MOST_CHANNELS = 64
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """PNG of an (h, w, 3) uint8 RGB or (h, w) uint16 image."""
+    """PNG of an (h, w, 3) uint8 RGB, (h, w) uint8 grey or (h, w) uint16 image."""
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _PNG_COLOR)
-    elif image.ndim == 2 and image.dtype == np.uint16:
-        ok, data = cv2.imencode(".png", image, _PNG_DEPTH)
+    elif image.ndim == 2 and image.dtype in (np.uint8, np.uint16):
+        ok, data = cv2.imencode(".png", image, _PNG_DEPTH if image.dtype == np.uint16 else _PNG_COLOR)
     else:
-        raise ValueError(f"a PNG is written from (h, w, 3) uint8 or (h, w) uint16, not {image.shape} {image.dtype}")
+        raise ValueError(f"a PNG is written from (h, w, 3) uint8 or (h, w) uint8 or uint16, not {image.shape} {image.dtype}")
     if not ok:
         raise ValueError("cv2 could not encode a PNG")
     return data.tobytes()
@@ -82,7 +82,7 @@ def encode_npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
-    """An RGB (h, w, 3) uint8 or (h, w) uint16 PNG of exactly that shape and type. Raises UserError."""
+    """An RGB (h, w, 3) uint8, grey (h, w) uint8 or (h, w) uint16 PNG of exactly that shape and type. Raises UserError."""
     data = read_bytes(path)
     if (fault := png_fault(data)) is not None:
         raise _damaged(path, "PNG", fault)

@@ -13,32 +13,35 @@ from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text, read_yaml
 from rsgen.sensors.imu import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_csv, imu_truth_csv
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
-from rsgen.sequence.format import STREAMS, color_truth_path, ground_truth, pose_lines
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.format import STREAMS, ground_truth, pose_lines
+from rsgen.sequence.images import Rig, Sequence
 from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, target_corners_text
 from rsgen.truth.settings import sequence_imu, sequence_target
 
-
-def check_truth_images(sequence: Sequence) -> tuple[bool, str]:
-    """Every colour frame has every exact image, all decode and are finite. Raises UserError naming the file."""
-    images = sequence.truth_images
-    paths = sequence.streams["color"].paths
-    for name, channels in images.items():
-        folder = sequence.root / "truth" / name
-        listed = {sequence.root / color_truth_path(name, channels, path.stem) for path in paths}
-        there = {path for path in folder.iterdir() if not is_temporary(path)} if folder.is_dir() else set()
-        if odd := sorted(listed ^ there):
-            what = "is missing" if odd[0] in listed else "belongs to no colour frame"
-            raise UserError(f"{odd[0]}: {what} ({len(odd)} in all): render again to complete")
-    with ThreadPoolExecutor() as pool:
-        for name in images:
-            finite = pool.map(lambda k, name=name: bool(np.isfinite(sequence.truth(name, k)).all()), range(len(paths)))
-            if not all(finite):
-                raise UserError(f"{sequence.root / 'truth' / name}: holds numbers that are not finite: render again")
-    return True, f"{', '.join(images)}: {len(paths)} each, all decode"
+_WORDS = {"color": "colour"}  # names as they are written in words
 
 
-def check_imu(sequence: Sequence) -> tuple[bool, str]:
+def check_truth_images(sequence: Rig) -> tuple[bool, str]:
+    """Every frame has every exact image, all decode and are finite. Raises UserError naming the file."""
+    names: dict[str, int] = {}
+    for stream in sequence.streams.values():
+        for name, channels in stream.truth_images.items():
+            folder = sequence.root / stream.files.truth / name
+            listed = {sequence.root / stream.files.truth_image(name, channels, path.stem) for path in stream.paths}
+            there = {path for path in folder.iterdir() if not is_temporary(path)} if folder.is_dir() else set()
+            if odd := sorted(listed ^ there):
+                owner = _WORDS.get(stream.name, stream.name)
+                what = "is missing" if odd[0] in listed else f"belongs to no {owner} frame"
+                raise UserError(f"{odd[0]}: {what} ({len(odd)} in all): render again to complete")
+            read = partial(sequence.exact_image, stream.name, name)
+            with ThreadPoolExecutor() as pool:
+                if not all(pool.map(lambda k, read=read: bool(np.isfinite(read(k)).all()), range(len(stream.paths)))):
+                    raise UserError(f"{folder}: holds numbers that are not finite: render again")
+            names[name] = names.get(name, 0) + len(stream.paths)
+    return True, f"{', '.join(names)}: {max(names.values())} each, all decode"
+
+
+def check_imu(sequence: Rig) -> tuple[bool, str]:
     """imu.csv is what the spline and the recorded settings give. Raises UserError."""
     found = sequence_imu(sequence)
     assert found is not None
@@ -78,7 +81,7 @@ def check_true_cameras(sequence: Sequence, config: dict[str, Any]) -> tuple[bool
     return True, f"{TRUE_CAMERAS} has them, sequence.yaml declares others"
 
 
-def check_target(sequence: Sequence) -> tuple[bool, str]:
+def check_target(sequence: Rig) -> tuple[bool, str]:
     """truth/target_corners.txt has the corners of the config's target. Raises UserError."""
     target = sequence_target(sequence)
     assert target is not None
@@ -88,7 +91,7 @@ def check_target(sequence: Sequence) -> tuple[bool, str]:
     return True, f"{target.grid.tag_count} tags, corners as config.target has them"
 
 
-def check_objects(sequence: Sequence) -> tuple[bool, str]:
+def check_objects(sequence: Rig) -> tuple[bool, str]:
     """Poses of all objects are what their splines give, and every exact image has a mask that decodes.
 
     Raises UserError.
@@ -104,27 +107,24 @@ def check_objects(sequence: Sequence) -> tuple[bool, str]:
         at = np.isin(found[:, 0], expected[:, 0]) if found.ndim == 2 and found.shape[1] == 8 else np.zeros(1, bool)
         if at.sum() != len(expected) or np.abs(found[at] - expected).max() > 1e-9:
             return False, f"{path}: is not what the object's spline gives: render again to write it"
-    seen = [
-        np.bincount(np.concatenate([sequence.object_ids(name, k).ravel() for k in range(len(stream.paths))]),
-                    minlength=len(sequence.objects) + 1)
-        for name, stream in sequence.streams.items()
-    ]  # fmt: skip
-    share = [100 * (1 - count[0] / max(count.sum(), 1)) for count in seen]
-    names = ", ".join(thing.name for thing in sequence.objects)
-    return True, f"{names}: {share[0]:.1f} % of colour's pixels, {share[1]:.1f} % of depth's"
+    seen = []
+    for name, stream in sequence.streams.items():
+        ids = np.concatenate([sequence.object_ids(name, k).ravel() for k in range(len(stream.paths))])
+        seen.append(f"{100 * float((ids > 0).mean()):.1f} % of {_WORDS.get(name, name)}'s pixels")
+    return True, f"{', '.join(thing.name for thing in sequence.objects)}: {', '.join(seen)}"
 
 
-def extra_checks(sequence: Sequence) -> list[tuple[str, Callable[[], tuple[bool, str]]]]:
+def extra_checks(sequence: Rig) -> list[tuple[str, Callable[[], tuple[bool, str]]]]:
     """Those of the checks that concern this sequence, by name."""
     config = sequence.meta.get("config")
     checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = []
-    if isinstance(config, dict) and config.get("declared") is not None:
+    if isinstance(sequence, Sequence) and isinstance(config, dict) and config.get("declared") is not None:
         checks.append(("true cameras", partial(check_true_cameras, sequence, config)))
     if isinstance(config, dict) and config.get("target") is not None:
         checks.append(("target", partial(check_target, sequence)))
     if sequence.objects:
         checks.append(("objects", partial(check_objects, sequence)))
-    if sequence.truth_images:
+    if any(stream.truth_images for stream in sequence.streams.values()):
         checks.append(("truth images", partial(check_truth_images, sequence)))
     if isinstance(config, dict) and config.get("imu") is not None:
         checks.append(("imu", partial(check_imu, sequence)))

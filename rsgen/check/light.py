@@ -18,7 +18,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rsgen.produce.frame_source import small_camera
+from rsgen.produce.camera_sources import small_camera
 from rsgen.produce.parts import load_scene, make_integrator, mirrored_samples
 
 Poses = Callable[[Any], FloatArray]

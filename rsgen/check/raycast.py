@@ -14,28 +14,32 @@ import trimesh
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import COLOR_DEPTH, ImageStream, Rig
 
 TOLERANCE_M = 1e-4
 REQUIRED_SHARE = 0.999
 
 
-def check_raycast(sequence: Sequence, count: int) -> tuple[bool, str]:
-    """Cast every pixel of `count` depth frames, spread over the sequence, again on scene.ply and compare.
+def check_raycast(sequence: Rig, name: str, count: int) -> tuple[bool, str]:
+    """Cast every pixel of `count` frames of a camera, spread over the sequence, again on scene.ply and compare.
+
+    Of a depth camera, or of another one that has exact depth beside its images (`truth.color_depth`).
 
     True if in every frame at least REQUIRED_SHARE of the pixels are within TOLERANCE_M and of the right object. Raises
     UserError if embreex is not installed, or scene.ply or a frame cannot be read.
     """
     casters = [_caster(path) for path in (sequence.root / "scene.ply", *(o.mesh for o in sequence.objects))]
-    total = len(sequence.streams["depth"].stamps)
+    stream = sequence.streams[name]
+    total = len(stream.stamps)
     if count < 1 or total == 0:
-        raise UserError(f"{sequence.root}: no depth frames to cast: ask for at least one")
+        raise UserError(f"{sequence.root}: no {name} frames to cast: ask for at least one")
     frames = np.unique(np.linspace(0, total - 1, count).round().astype(int)).tolist()
     differences, shares = [], []
     for k in frames:
-        z, number = _cast(casters, sequence, k)
-        differences.append(np.abs(z - sequence.truth_depth(k)))
-        right = (differences[-1] <= TOLERANCE_M) & (number == sequence.object_ids("depth", k))
+        z, number = _cast(casters, sequence, stream, k)
+        exact = sequence.exact_depth(name, k) if stream.is_depth else sequence.exact_image(name, COLOR_DEPTH, k)
+        differences.append(np.abs(z - exact))
+        right = (differences[-1] <= TOLERANCE_M) & (number == sequence.object_ids(name, k))
         shares.append(float(np.mean(right)))
     return min(shares) >= REQUIRED_SHARE, (
         f"{len(frames)} frames, worst: {100 * min(shares):.4f} % of pixels within {1000 * TOLERANCE_M:g} mm, "
@@ -54,18 +58,19 @@ def _caster(path: Path) -> Any:
         raise UserError(f"{path}: cannot be read ({type(error).__name__})") from None
 
 
-def _cast(casters: list[Any], sequence: Sequence, k: int) -> tuple[FloatArray, IntArray]:
-    """Planar z (h, w) of listed depth frame k, 0 where a ray hits nothing, and the number of the object hit (h, w)."""
-    stream = sequence.streams["depth"]
+def _cast(casters: list[Any], sequence: Rig, stream: ImageStream, k: int) -> tuple[FloatArray, IntArray]:
+    """Planar z (h, w) of listed frame k, 0 where a ray hits nothing, and the number of the object hit (h, w)."""
     camera = stream.camera
     uv = camera.pixel_grid().reshape(-1, 2)
-    T_world_depth = sequence.pixel_poses("depth", k, uv)
-    t = stream.shutter.line_mid_time(float(stream.stamps[k]), stream.shutter.line_of_pixel(uv, camera), camera)
+    T_world_cam = sequence.pixel_poses(stream.name, k, uv)
+    exposure_s = stream.shutter.exposure_s if stream.table is None else float(stream.table.exposure_s[k])
+    middle = float(stream.stamps[k]) - 0.5 * (exposure_s - stream.shutter.exposure_s)
+    t = stream.shutter.line_mid_time(middle, stream.shutter.line_of_pixel(uv, camera), camera)
     z, number = np.full(len(uv), np.inf), np.zeros(len(uv), np.int64)
     for which, caster in enumerate(casters):
-        T = T_world_depth
+        T = T_world_cam
         if which:
-            T = se3.inverse(sequence.objects[which - 1].spline.pose(t)) @ T_world_depth
+            T = se3.inverse(sequence.objects[which - 1].spline.pose(t)) @ T_world_cam
         direction = np.einsum("nij,nj->ni", T[:, :3, :3], camera.unproject(uv))
         _, ray, p = caster.intersects_id(T[:, :3, 3], direction, multiple_hits=False, return_locations=True)
         there = se3.transform(se3.inverse(T[ray]), p)[:, 2]

@@ -15,7 +15,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
 from rsgen.geometry.spline import Spline
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import Rig
 
 # Depth is interpolated bilinearly in 1/z, exact on planes. Where second differences say that this is off by more, there
 # is an edge, or a curve too tight for the pixels: such places say nothing about poses, at any resolution.
@@ -76,16 +76,17 @@ class Reprojection:
     number: IntArray
 
 
-def check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
-    """The worst pair decides: one frame that does not fit must not drown in nineteen that do."""
-    neighbours = _neighbours(sequence, pairs)
+def check_reprojection(sequence: Rig, name: str, pairs: int) -> tuple[bool, str]:
+    """Of a depth camera. The worst pair decides: one frame that does not fit must not drown in nineteen that do."""
+    sequence = sequence.seen_from(name)
+    neighbours = _neighbours(sequence, name, pairs)
     if not neighbours:
         return True, "no two neighbouring depth frames: nothing to compare"
     sizes, worst, ok = [], (-1.0, ""), True
     for k, next_k in neighbours:
-        result = reproject_depth(sequence, k, next_k)
+        result = reproject_depth(sequence, k, next_k, name)
         size = np.abs(result.residual)
-        frame = f"frames {sequence.streams['depth'].indices[k]}-{sequence.streams['depth'].indices[next_k]}"
+        frame = "frames {}-{}".format(*sequence.streams[name].indices[[k, next_k]])
         if len(size) < max(MINIMUM_PIXELS, OCCLUDED_SHARE * (len(size) + result.occluded)):
             return False, f"{frame}: only {len(size)} pixels agree on a surface, {result.occluded} are hidden"
         median, share = float(np.median(size)), float((size <= INLIER_M).mean())
@@ -93,8 +94,8 @@ def check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
         for which in np.unique(result.number[result.number > 0]):  # nor an object that moves another way
             part = size[result.number == which]
             if len(part) >= MINIMUM_PIXELS and not np.median(part) <= INLIER_M:
-                name = sequence.objects[which - 1].name
-                return False, f"{frame}: object {name} is off by {np.median(part) * 1e3:.1f} mm in the median"
+                thing = sequence.objects[which - 1].name
+                return False, f"{frame}: object {thing} is off by {np.median(part) * 1e3:.1f} mm in the median"
         sizes.append(size)
         worst = max(worst, (median, f"{frame}: median {median * 1e3:.4f} mm, {share:.2%} within"))
     size = np.concatenate(sizes)
@@ -105,7 +106,7 @@ def check_reprojection(sequence: Sequence, pairs: int) -> tuple[bool, str]:
     )
 
 
-def check_scene(sequence: Sequence) -> tuple[bool, str]:
+def check_scene(sequence: Rig) -> tuple[bool, str]:
     """scene.ply is whole, and what a few depth frames show lies within its bounds."""
     path = sequence.root / "scene.ply"
     if not path.is_file():
@@ -119,9 +120,10 @@ def check_scene(sequence: Sequence) -> tuple[bool, str]:
     if not whole:
         raise UserError(f"{path}: is not a whole mesh: write it again")
     outside = 0.0
-    for k in np.unique(np.linspace(0, len(sequence.streams["depth"].paths) - 1, _SCENE_FRAMES).round().astype(int)):
-        p_world = depth_points(sequence, int(k))
-        outside = max(outside, float(np.maximum(bounds[0] - p_world, p_world - bounds[1]).max(initial=0.0)))
+    for stream in (stream for stream in sequence.streams.values() if stream.is_depth):
+        for k in np.unique(np.linspace(0, len(stream.paths) - 1, _SCENE_FRAMES).round().astype(int)):
+            p_world = depth_points(sequence, int(k), stream.name)
+            outside = max(outside, float(np.maximum(bounds[0] - p_world, p_world - bounds[1]).max(initial=0.0)))
     size = " x ".join(f"{length:.2f}" for length in bounds[1] - bounds[0])
     detail = f"{counts[1]} triangles, {size} m, depth at most {outside * 1e3:.3f} mm outside"
     return outside <= INLIER_M, detail
@@ -135,8 +137,10 @@ def _ply_counts(path: Path) -> tuple[int, int]:
     return elements.get("vertex", 0), elements.get("face", 0)
 
 
-def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
+def reproject_depth(sequence: Rig, k: int, next_k: int, name: str = "depth") -> Reprojection:
     """Compare exact depth of listed frame k with that of frame next_k, every fourth pixel and row by row.
+
+    name: of the depth camera, which is the body.
 
     Pixels of frame k go to the world with their own line's pose and into the other frame with the rolling-shutter
     projection (3); the planar z predicted there is compared with the observed one, interpolated bilinearly in inverse
@@ -144,10 +148,10 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
     (edges), and points hidden by a nearer surface.
     Raises UserError for unreadable files.
     """
-    stream = sequence.streams["depth"]
+    stream = sequence.streams[name]
     stamp = float(stream.stamps[next_k])
-    next_z = sequence.truth_depth(next_k).astype(np.float64)
-    seen = _depth_pixels(sequence, k)
+    next_z = sequence.exact_depth(name, next_k).astype(np.float64)
+    seen = _depth_pixels(sequence, k, name)
     residuals, numbers, occluded = [np.zeros(0)], [np.zeros(0, np.int64)], 0
     for which in range(len(sequence.objects) + 1):
         here = seen.number == which
@@ -171,12 +175,12 @@ def reproject_depth(sequence: Sequence, k: int, next_k: int) -> Reprojection:
     return Reprojection(np.concatenate(residuals), occluded, np.concatenate(numbers))
 
 
-def depth_points(sequence: Sequence, k: int) -> FloatArray:
+def depth_points(sequence: Rig, k: int, name: str) -> FloatArray:
     """Points (n, 3) in the world that every fourth pixel of exact depth k shows, each from its own line's pose.
 
     Without those on moving objects. Raises UserError for unreadable files.
     """
-    seen = _depth_pixels(sequence, k)
+    seen = _depth_pixels(sequence, k, name)
     return seen.p_world[seen.number == 0]
 
 
@@ -189,16 +193,16 @@ class _DepthPixels:
     t: FloatArray
 
 
-def _depth_pixels(sequence: Sequence, k: int) -> _DepthPixels:
-    """What every fourth row and column of exact depth k shows."""
-    stream = sequence.streams["depth"]
+def _depth_pixels(sequence: Rig, k: int, name: str) -> _DepthPixels:
+    """What every fourth row and column of exact depth k of a camera shows."""
+    stream = sequence.streams[name]
     camera = stream.camera
     step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
-    z = sequence.truth_depth(k)[::step, ::step].astype(np.float64)
+    z = sequence.exact_depth(name, k)[::step, ::step].astype(np.float64)
     uv = camera.pixel_grid()[::step, ::step][z > 0]
-    p_world = se3.transform(sequence.pixel_poses("depth", k, uv), camera.backproject(uv, z[z > 0]))
+    p_world = se3.transform(sequence.pixel_poses(name, k, uv), camera.backproject(uv, z[z > 0]))
     t = stream.shutter.line_mid_time(float(stream.stamps[k]), stream.shutter.line_of_pixel(uv, camera), camera)
-    return _DepthPixels(p_world, sequence.object_ids("depth", k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t))
+    return _DepthPixels(p_world, sequence.object_ids(name, k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t))
 
 
 def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -218,8 +222,8 @@ def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, Boo
     return 1 / np.where(holds, sum_inverse, 1.0), holds
 
 
-def _neighbours(sequence: Sequence, pairs: int) -> list[tuple[int, int]]:
+def _neighbours(sequence: Rig, name: str, pairs: int) -> list[tuple[int, int]]:
     """Up to `pairs` pairs of consecutive depth frames, spread evenly."""
-    first = np.flatnonzero(np.diff(sequence.streams["depth"].indices) == 1)
+    first = np.flatnonzero(np.diff(sequence.streams[name].indices) == 1)
     chosen = np.unique(np.linspace(0, max(len(first) - 1, 0), min(pairs, len(first))).round().astype(int))
     return [(int(first[i]), int(first[i]) + 1) for i in chosen]

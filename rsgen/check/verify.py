@@ -26,16 +26,14 @@ from rsgen.geometry import se3
 from rsgen.produce.records import fingerprint
 from rsgen.sensors.reports import reported_poses
 from rsgen.sequence.format import (
-    FOLDERS,
     STAMP_TOLERANCE_S,
     STREAMS,
-    TRUTH_DEPTH,
-    StreamName,
     associate,
     line_poses,
     pose_rows,
 )
-from rsgen.sequence.reader import ImageStream, Sequence, read_sequence
+from rsgen.sequence.images import COLOR_DEPTH, ImageStream, Rig, Sequence
+from rsgen.sequence.reader import read_rig
 from rsgen.truth.settings import sequence_mocap
 
 # Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
@@ -81,26 +79,37 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> Verificati
     """
     path = Path(path)
     try:
-        stated = read_sequence(path)
-        sequence = stated.as_taken
+        stated = read_rig(path)
+        sequence = stated.as_taken if isinstance(stated, Sequence) else stated
     except UserError as error:
         return Verification(path, (Check("read", False, str(error)),))
+    depths = [name for name, stream in sequence.streams.items() if stream.is_depth]
     checks: list[tuple[str, Callable[[], tuple[bool, str]]]] = [
         ("description", partial(_check_description, stated)),
         ("files", partial(_check_files, sequence)),
         ("clocks", partial(_check_clocks, sequence)),
         ("images", partial(_check_images, sequence)),
-        *((f"rows {name}", partial(_check_rows, sequence, name)) for name in STREAMS),
+        *((f"rows {name}", partial(_check_rows, sequence, name)) for name in sequence.streams),
         ("ground truth", partial(_check_ground_truth, sequence)),
         ("scene", partial(check_scene, sequence)),
-        ("reprojection", partial(check_reprojection, sequence, pairs)),
-    ]
+        *((_titled("reprojection", depths, name), partial(check_reprojection, sequence, name, pairs))
+          for name in depths),
+    ]  # fmt: skip
     checks += extra_checks(sequence)
     if raycast:
         from rsgen.check.raycast import check_raycast
 
-        checks.append(("ray casting", partial(check_raycast, sequence, raycast)))
+        # Of two cameras depth alone, as always; of a rig all whose exact depth is there.
+        of_rig = [name for name, s in sequence.streams.items() if s.is_depth or COLOR_DEPTH in s.truth_images]
+        cast = depths if isinstance(sequence, Sequence) else of_rig
+        checks += [
+            (_titled("ray casting", cast, name), partial(check_raycast, sequence, name, raycast)) for name in cast
+        ]
     return Verification(path, tuple(_run(name, check) for name, check in checks))
+
+
+def _titled(what: str, cameras: list[str], name: str) -> str:
+    return what if len(cameras) == 1 else f"{what} {name}"
 
 
 def _run(name: str, check: Callable[[], tuple[bool, str]]) -> Check:
@@ -110,23 +119,25 @@ def _run(name: str, check: Callable[[], tuple[bool, str]]) -> Check:
         return Check(name, False, str(error))
 
 
-def _check_description(sequence: Sequence) -> tuple[bool, str]:
+def _check_description(sequence: Rig) -> tuple[bool, str]:
     """sequence.yaml is as it was written: its streams are those of its config, and the fingerprint is theirs."""
     meta, config = sequence.meta, sequence.meta.get("config")
     if not isinstance(config, dict):
         return False, "sequence.yaml holds no config"
     declared = _said(config.get("declared"))
-    for name in STREAMS:
-        stated, asked = meta["streams"][name], config.get(name)
+    cameras = config if isinstance(sequence, Sequence) else _said(config.get("streams"))
+    for name in sequence.streams:
+        stated, asked = meta["streams"][name], cameras.get(name)
         if not isinstance(asked, dict):
             return False, f"config.{name} is missing in sequence.yaml"
         asked = asked | {"size": [asked.get("width"), asked.get("height")]} | _said(declared.get(name))
         for field in stated.keys() & asked.keys():
             if stated[field] != asked[field]:
                 return False, f"streams.{name}.{field} is {stated[field]}, but config says {asked[field]}"
-    asked = {"T_color_depth": config.get("T_color_depth")} | _said(declared)
-    if asked["T_color_depth"] != meta["T_color_depth"]:
-        return False, "T_color_depth is not that of config"
+    if isinstance(sequence, Sequence):
+        asked = {"T_color_depth": config.get("T_color_depth")} | _said(declared)
+        if asked["T_color_depth"] != meta["T_color_depth"]:
+            return False, "T_color_depth is not that of config"
     try:
         found = fingerprint({key: meta.get(key) for key in ("config", "inputs", "versions")})
     except (TypeError, ValueError):  # no numbers and words only, so not what was written
@@ -141,16 +152,17 @@ def _said(section: Any) -> dict[str, Any]:
     return {key: value for key, value in section.items() if value is not None} if isinstance(section, dict) else {}
 
 
-def _check_files(sequence: Sequence) -> tuple[bool, str]:
+def _check_files(sequence: Rig) -> tuple[bool, str]:
     counts = []
-    for name in STREAMS:
-        stream, folder = sequence.streams[name], sequence.root / FOLDERS[name]
-        _compare_names(folder, {path.name for path in stream.paths})
+    for name, stream in sequence.streams.items():
+        _compare_names(sequence.root / stream.files.images, {path.name for path in stream.paths})
         part = "" if len(stream.paths) == stream.frames else f" of {stream.frames} (rendered in part)"
         counts.append(f"{len(stream.paths)} {name}{part}")
-    _compare_names(sequence.root / TRUTH_DEPTH, {f"{path.stem}.exr" for path in sequence.streams["depth"].paths})
-    pairs = _read_pairs(sequence)
-    return True, f"{', '.join(counts)}, {pairs} pairs"
+        if stream.is_depth:
+            exact = {f"{path.stem}.exr" for path in stream.paths}
+            _compare_names(sequence.root / stream.files.exact_depth, exact)
+    pairs = f", {_read_pairs(sequence)} pairs" if isinstance(sequence, Sequence) else ""
+    return True, ", ".join(counts) + pairs
 
 
 def _compare_names(folder: Path, listed: set[str]) -> None:
@@ -185,11 +197,10 @@ def _entry(sequence: Sequence, stream: ImageStream, k: int) -> tuple[str, str]:
     return f"{stream.listed[k]:.9f}", stream.paths[k].relative_to(sequence.root).as_posix()
 
 
-def _check_clocks(sequence: Sequence) -> tuple[bool, str]:
+def _check_clocks(sequence: Rig) -> tuple[bool, str]:
     """True stamps against first stamp and rate; the reader has compared the listed ones with what they should be."""
     details, ok = [], True
-    for name in STREAMS:
-        stream = sequence.streams[name]
+    for name, stream in sequence.streams.items():
         shows = stream.indices if stream.table is None else stream.table.shows
         error = np.abs(stream.stamps - (stream.first_stamp_s + shows / stream.rate_hz)).max()
         ok &= bool(error <= STAMP_TOLERANCE_S and (np.diff(stream.indices) > 0).all())
@@ -199,25 +210,36 @@ def _check_clocks(sequence: Sequence) -> tuple[bool, str]:
     return ok, ", ".join(details)
 
 
-def _check_images(sequence: Sequence) -> tuple[bool, str]:
-    color, depth = sequence.streams["color"], sequence.streams["depth"]
-    noisy = bool(sequence.meta.get("noise")) or depth.registered
+def _check_images(sequence: Rig) -> tuple[bool, str]:
+    worst, where = 0.0, ""
     with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda k: sequence.color(k).size, range(len(color.paths))))
-        units = list(pool.map(partial(_quantisation_error, sequence, noisy), range(len(depth.paths))))
-    if noisy:
+        for name, stream in sequence.streams.items():
+            of_frame = partial(_quantisation_error if stream.is_depth else _decodes, sequence, name)
+            units = list(pool.map(of_frame, range(len(stream.paths))))
+            if max(units, default=0.0) > worst:
+                worst, where = max(units), f" ({stream.paths[int(np.argmax(units))]})"
+    if any(_is_noisy(sequence, name) for name, stream in sequence.streams.items() if stream.is_depth):
         return True, "all decode (noise or registration is on: 16-bit depth not compared with the exact one)"
-    worst = int(np.argmax(units))
-    detail = f"all decode, 16-bit depth within {units[worst]:.3f} units of the exact one"
-    return units[worst] <= 0.5 + 1e-6, detail + (f" ({depth.paths[worst]})" if units[worst] > 0.5 + 1e-6 else "")
+    detail = f"all decode, 16-bit depth within {worst:.3f} units of the exact one"
+    return worst <= 0.5 + 1e-6, detail + (where if worst > 0.5 + 1e-6 else "")
 
 
-def _quantisation_error(sequence: Sequence, noisy: bool, k: int) -> float:
+def _is_noisy(sequence: Rig, name: str) -> bool:
+    """Whether a depth camera reports other depths than the exact ones."""
+    return _said(sequence.meta.get("noise")).get(name, "none") != "none" or sequence.streams[name].registered
+
+
+def _decodes(sequence: Rig, name: str, k: int) -> float:
+    sequence.picture(name, k)
+    return 0.0
+
+
+def _quantisation_error(sequence: Rig, name: str, k: int) -> float:
     """Largest difference in stored units between depth k and exact depth k; inf where one of them is missing."""
-    units, exact = sequence.depth_units(k), sequence.truth_depth(k)
-    if noisy:
+    units, exact = sequence.units(name, k), sequence.exact_depth(name, k)
+    if _is_noisy(sequence, name):
         return 0.0
-    expected = exact.astype(np.float64) * sequence.streams["depth"].depth_scale
+    expected = exact.astype(np.float64) * sequence.streams[name].depth_scale
     # A value that rounds to 0 or beyond 16 bits is stored as nothing.
     storable = (expected > 0.5) & (expected < 65535.5)
     if (units[~storable] > 0).any() or (units[storable] == 0).any():
@@ -225,12 +247,11 @@ def _quantisation_error(sequence: Sequence, noisy: bool, k: int) -> float:
     return float(np.abs(units[storable] - expected[storable]).max(initial=0.0))
 
 
-def _check_rows(sequence: Sequence, name: StreamName) -> tuple[bool, str]:
+def _check_rows(sequence: Rig, name: str) -> tuple[bool, str]:
     stream = sequence.streams[name]
-    T_cam_body = sequence.T_color_depth if name == "color" else None
     found = sequence.rows(name)
     exposure_s = None if stream.table is None else stream.table.exposure_s
-    expected = line_poses(sequence.spline, stream.camera, stream.shutter, stream.stamps, T_cam_body, exposure_s)
+    expected = line_poses(sequence.spline, stream.camera, stream.shutter, stream.stamps, stream.T_cam_body, exposure_s)
     ok, detail, worst = _pose_errors(found.reshape(-1, 7), expected.reshape(-1, 7))
     frame, line = divmod(worst, stream.line_count)
     where = "" if ok else f", worst in frame {stream.indices[frame]}, line {line}"
@@ -248,7 +269,8 @@ def _pose_errors(found: FloatArray, expected: FloatArray) -> tuple[bool, str, in
     return bool(good.all()), f"max {metres.max():.1e} m, {radians.max():.1e} rad", worst
 
 
-def _check_ground_truth(sequence: Sequence) -> tuple[bool, str]:
+def _check_ground_truth(sequence: Rig) -> tuple[bool, str]:
+    T_image_body = sequence.T_image_depth if isinstance(sequence, Sequence) else np.eye(4)
     path = sequence.root / "groundtruth.txt"
     lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     try:
@@ -260,7 +282,7 @@ def _check_ground_truth(sequence: Sequence) -> tuple[bool, str]:
     if (np.diff(rows[:, 0]) <= 0).any():
         raise UserError(f"{path}: stamps do not increase")
     if (mocap := sequence_mocap(sequence)) is not None:
-        expected = reported_poses(sequence.spline, *mocap, sequence.T_image_depth)
+        expected = reported_poses(sequence.spline, *mocap, T_image_body)
         if len(rows) != len(expected) or np.abs(rows[:, 0] - expected[:, 0]).max() > STAMP_TOLERANCE_S:
             return False, "its stamps are not those of the motion capture in config.mocap"
         ok, detail, _ = _pose_errors(rows[:, 1:], expected[:, 1:])
@@ -268,6 +290,6 @@ def _check_ground_truth(sequence: Sequence) -> tuple[bool, str]:
     stamps = np.concatenate([stream.stamps for stream in sequence.streams.values()])
     if lacking := int((~np.isin(stamps, rows[:, 0])).sum()):
         return False, f"{lacking} of {len(stamps)} frame stamps are not in it"
-    T = sequence.spline.pose(rows[:, 0]) @ se3.inverse(sequence.T_image_depth)
+    T = sequence.spline.pose(rows[:, 0]) @ se3.inverse(T_image_body)
     ok, detail, _ = _pose_errors(rows[:, 1:], pose_rows(T))
     return ok, f"{len(rows)} poses, against the spline {detail}"

@@ -10,14 +10,17 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from rsgen.array_types import FloatArray
 from rsgen.config.cameras import ColorConfig, DepthConfig, StreamConfig
 from rsgen.config.faults import FaultsConfig, as_declared, from_recorded, moved_to, to_recorded
 from rsgen.config.imu import ImuConfig
 from rsgen.config.motion import MOST_OBJECTS, MotionConfig, ObjectConfig, TremorConfig, content_of
 from rsgen.config.presets import Preset, with_presets
+from rsgen.config.rig import RigStream, T_cam_body, check_stereo, with_left_cameras
 from rsgen.config.sections import (
     LightConfig,
     MocapConfig,
@@ -31,7 +34,7 @@ from rsgen.errors import UserError
 from rsgen.files import parse_yaml
 from rsgen.inputs import check_input
 from rsgen.limits import Matrix4, RigidTransform
-from rsgen.sequence.format import STREAMS
+from rsgen.sequence.format import IMAGE_KINDS, MOST_CAMERAS, STREAMS, CameraName
 
 __all__ = ["Config", "StreamConfig", "describe_fields", "load_config", "validate_config"]
 
@@ -39,7 +42,9 @@ Backend = Literal["auto", "llvm", "cuda"]
 # Fields that change how fast or where a sequence is made, never one byte of it.
 _NOT_CONTENT = {"backend", "faults"}
 # Sections that are left out where they are not set: sequences rendered before there were any stay the same.
-_LATER = ("target", "objects")
+_LATER = ("target", "objects", "streams")
+# Sections of a sequence of two cameras, in place of which a rig has `streams`.
+_TWO_CAMERAS = ("color", "depth", "T_color_depth")
 # Fields that hold paths, by section.
 _PATHS = (("trajectory", "file"), ("scene", "file"))
 # PyYAML lets impossible dates, endless digits and endless nesting through as these.
@@ -71,6 +76,10 @@ class Config(Section):
         default=((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
         description="depth-camera to colour-camera coordinates, m",
     )
+    streams: dict[CameraName, RigStream] = Field(
+        default={}, max_length=MOST_CAMERAS,
+        description="a rig: any cameras by name, in place of color, depth and T_color_depth (docs/format.md); {}: none",
+    )  # fmt: skip
     truth: TruthConfig = TruthConfig()
     imu: ImuConfig | None = None
     mocap: MocapConfig | None = None
@@ -95,6 +104,18 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _is_a_rig_or_two_cameras(self) -> Config:
+        if not self.streams:
+            return self
+        if twice := sorted(self.model_fields_set & set(_TWO_CAMERAS)):
+            raise ValueError(f"{twice[0]}: a rig has its cameras in streams: describe it there, or remove streams")
+        faults = self.injected
+        if not faults.declared is faults.color is faults.depth is None:
+            raise ValueError("faults: of a rig can be those of the IMU only: remove the others, or streams")
+        check_stereo(self.streams)
+        return self
+
+    @model_validator(mode="after")
     def _has_possible_faults(self) -> Config:
         for name in STREAMS:
             try:
@@ -104,6 +125,25 @@ class Config(Section):
         if self.imu is None and self.injected.imu is not None:
             raise ValueError("faults.imu: there is no IMU: add a section imu, or remove it")
         return self
+
+    @property
+    def cameras(self) -> dict[str, ColorConfig | DepthConfig]:
+        """All cameras by name: of a rig, else "color" and "depth"."""
+        return {**self.streams} if self.streams else {"color": self.color, "depth": self.depth}
+
+    def T_cam_body(self, camera: str) -> FloatArray:
+        """Pose (4, 4) of a camera in the body; of two cameras the body is the depth camera."""
+        if self.streams:
+            return T_cam_body(self.streams[camera])
+        return np.asarray(self.T_color_depth, float) if camera == "color" else np.eye(4)
+
+    @property
+    def view(self) -> str:
+        """The camera whose view light is made for: the first one of colour, else of grey, else of depth."""
+        if not self.streams:
+            return "color"
+        of_kind = (name for kind in IMAGE_KINDS for name, camera in self.streams.items() if camera.kind == kind)
+        return next(of_kind, next(iter(self.streams)))
 
     @property
     def injected(self) -> FaultsConfig:
@@ -131,7 +171,8 @@ class Config(Section):
     def content(self) -> dict[str, Any]:
         """All that decides the sequence's bytes, as sequence.yaml records it: plain YAML types, files by name."""
         unset = {name for name in _LATER if not getattr(self, name)}
-        content = self.model_dump(mode="json", exclude=_NOT_CONTENT | unset)
+        absent = set(_TWO_CAMERAS) if self.streams else set()
+        content = self.model_dump(mode="json", exclude=_NOT_CONTENT | unset | absent)
         for section, name in _PATHS:
             if content[section][name] is not None:
                 content[section][name] = Path(content[section][name]).name
@@ -191,10 +232,14 @@ def recorded_config(data: dict[str, Any], where: str) -> Config:
 def validate_config(data: dict[str, Any], where: str) -> Config:
     """A config from plain YAML types; `where` begins the message. Raises UserError naming every wrong field."""
     try:
-        return Config.model_validate(with_presets(data))
+        return Config.model_validate(_completed(with_presets(data)))
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
         raise _error(f"{where}: {problems}") from None
+
+
+def _completed(data: dict[str, Any]) -> dict[str, Any]:
+    return data | {"streams": with_left_cameras(data["streams"])} if "streams" in data else data
 
 
 def _error(text: str) -> UserError:

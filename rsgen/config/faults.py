@@ -143,7 +143,7 @@ def split_imu(recorded: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any] 
 
 def to_recorded(config: dict[str, Any], faults: FaultsConfig) -> dict[str, Any]:
     """The inverse: a config as sequence.yaml records it. Values that are not set are left out where they came later."""
-    for name in STREAMS:
+    for name in config.keys() & set(STREAMS):  # a rig has its cameras elsewhere, and none of these faults
         driver = getattr(faults, name)
         recorded = None if driver is None else driver.model_dump(mode="json")
         if recorded is not None and not driver.blackouts:

@@ -123,17 +123,17 @@ def _drive(motion: ObjectMotionConfig, t: FloatArray) -> FloatArray:
 
 def check_objects_clear(
     names: Sequence[str], splines: Sequence[Spline], triangles: Sequence[FloatArray], camera: Spline,
-    span: tuple[float, float], T_color_depth: FloatArray,
+    span: tuple[float, float], cameras: Sequence[FloatArray],
 ) -> None:  # fmt: skip
-    """Raises UserError if an object comes through either camera within `span` (s). triangles (m, 3, 3): in its frame.
+    """Raises UserError if an object comes through a camera within `span` (s). triangles (m, 3, 3): in its frame.
 
-    camera: T_world_depth.
+    camera: T_world_body; cameras: T_cam_body (4, 4) of each.
     """
     for name, spline, corners in zip(names, splines, triangles, strict=True):
         radius = float(np.linalg.norm(corners, axis=-1).max()) + _NEAR_M
-        for T_eye_depth in (np.eye(4), T_color_depth):
+        for T_eye_body in cameras:
 
-            def way(t: FloatArray, spline: Spline = spline, T_eye: FloatArray = T_eye_depth) -> FloatArray:
+            def way(t: FloatArray, spline: Spline = spline, T_eye: FloatArray = T_eye_body) -> FloatArray:
                 return np.asarray((se3.inverse(spline.pose(t)) @ camera.pose(t) @ se3.inverse(T_eye))[:, :3, 3])
 
             t = np.linspace(*span, max(2, math.ceil((span[1] - span[0]) / _CHECK_S)))

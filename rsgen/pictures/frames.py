@@ -17,7 +17,7 @@ from rsgen.config.config import Config, recorded_config
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_yaml
-from rsgen.produce.frame_source import setting_of
+from rsgen.produce.camera_sources import setting_of
 from rsgen.produce.generate import ORIGIN
 from rsgen.produce.parts import open_frames, scene_hash
 from rsgen.sequence.reader import read_sequence
@@ -73,8 +73,8 @@ def compare_frame(
     at = {stream.name: int(np.flatnonzero(stream.indices == frame)[0]) for stream in (color, depth)}
     middle = {s.name: float(s.stamps[at[s.name]]) + s.shutter.readout_s / 2 for s in (color, depth)}
     setting = setting_of(config.color, color.table, at["color"])
-    colors = source.color(sequence.spline, middle["color"], frame, setting), sequence.color(at["color"])
-    depths = source.depth(sequence.spline, middle["depth"]), sequence.truth_depth(at["depth"])
+    colors = source.color.picture(sequence.spline, middle["color"], frame, setting), sequence.color(at["color"])
+    depths = source.depth.exact(sequence.spline, middle["depth"]), sequence.truth_depth(at["depth"])
     title = (
         f"{sequence.name}, frame {frame}: readout {1000 * color.shutter.readout_s:g} ms (colour), "
         f"{1000 * depth.shutter.readout_s:g} ms (depth); global shutter at the middle line's time"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,7 +25,6 @@ from rsgen.produce.frame_source import FrameSource, render_shots
 from rsgen.produce.parts import engine_versions, mesh_hashes, open_frames, scene_hash
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Setting
-from rsgen.sequence.format import StreamName
 
 # Images a job makes: a few seconds of work and some megabytes of files.
 _BLOCK = 8
@@ -35,17 +34,16 @@ _BLOCK = 8
 class SequenceRecipe:
     """What a worker has to know of a sequence to render any of its frames.
 
-    stamps_color (n,) and stamps_depth (m,): s, of all frames; versions, inputs: as in sequence.yaml. settings: of the
-    automatic camera, of all colour frames; empty without one. objects: T_world_object(t) of the config's.
+    stamps: of each camera those (n,), s, of all frames; versions, inputs: as in sequence.yaml. settings: of each
+    automatic camera, of all its frames. objects: T_world_object(t) of the config's.
     """
 
     config: Config
     spline: Spline
-    stamps_color: FloatArray
-    stamps_depth: FloatArray
+    stamps: Mapping[str, FloatArray]
     versions: Mapping[str, str]
     inputs: Mapping[str, str]
-    settings: tuple[Setting, ...] = ()
+    settings: Mapping[str, tuple[Setting, ...]] = field(default_factory=dict)
     objects: tuple[Spline, ...] = ()
 
 
@@ -54,12 +52,12 @@ class RenderJob:
     """Images (frame, stream) that one job renders."""
 
     plan: SequenceRecipe
-    shots: tuple[tuple[int, StreamName], ...]
+    shots: tuple[tuple[int, str], ...]
 
 
 def render_blocks(
     writer: SequenceWriter,
-    shots: Sequence[tuple[int, StreamName]],
+    shots: Sequence[tuple[int, str]],
     versions: Mapping[str, str],
     inputs: Mapping[str, str],
     workers: Workers,
@@ -72,11 +70,10 @@ def render_blocks(
     plan = SequenceRecipe(
         _for_other_processes(writer.config, versions),
         writer.spline,
-        writer.stamps("color"),
-        writer.stamps("depth"),
+        {name: writer.stamps(name) for name in writer.streams},
         versions,
         inputs,
-        writer.settings,
+        dict(writer.settings),
         writer.objects,
     )
     blocks = [RenderJob(plan, tuple(shots[i : i + _BLOCK])) for i in range(0, len(shots), _BLOCK)]
@@ -96,9 +93,10 @@ def render_block(block: RenderJob, progress: Progress) -> dict[str, bytes]:
     source = _source(plan, progress)
     with TemporaryDirectory(prefix="rsgen-") as folder:
         out = Path(folder) / plan.config.name
-        stamps = plan.stamps_color, plan.stamps_depth
-        writer = SequenceWriter.open(out, plan.config, plan.spline, *stamps, plan.versions, plan.inputs, plan.objects)
-        writer = writer.adapted(plan.settings) if plan.settings else writer
+        identity = plan.versions, plan.inputs
+        writer = SequenceWriter.open(out, plan.config, plan.spline, plan.stamps, *identity, plan.objects)
+        for name, settings in plan.settings.items():
+            writer = writer.adapted(name, settings)
         before = set(out.rglob("*"))
         render_shots(writer, source, block.shots, no_progress)
         made = sorted(path for path in set(out.rglob("*")) - before if path.is_file())

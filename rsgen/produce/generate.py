@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.config.cameras import ColorConfig
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
@@ -30,7 +29,6 @@ from rsgen.produce.parts import (
 )
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Reading, Setting, adapt
-from rsgen.sequence.format import STREAMS
 from rsgen.sequence.truth_files import mesh_file
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
@@ -57,15 +55,13 @@ def render_sequence(
     if not (out / "sequence.yaml").exists():
         scene = load_scene(config)
         _check_ways(config, motion, meshes, scene)
-    writer = SequenceWriter.open(
-        out, config, motion.spline, stamps["color"], stamps["depth"], *identity, motion.objects
-    )
+    writer = SequenceWriter.open(out, config, motion.spline, stamps, *identity, motion.objects)
     write_origin(out, config)
     source = None
-    if config.color.adapts:
-        source = open_frames(config, progress, scene=scene, objects=writer.objects)
-        writer = writer.adapted(automatic_settings(config.color, source, writer, progress))
-    todo = sorted((k, s) for s in STREAMS for k in _chosen(writer.missing(s), frames, len(stamps[s])))
+    for name in (name for name, camera in config.cameras.items() if camera.adapts):
+        source = source or open_frames(config, progress, scene=scene, objects=writer.objects)
+        writer = writer.adapted(name, automatic_settings(name, source, writer, progress))
+    todo = sorted((k, s) for s in config.cameras for k in _chosen(writer.missing(s), frames, len(stamps[s])))
     if not (out / "scene.ply").is_file():
         scene = scene or load_scene(config)
         write_scene_ply(scene, out / "scene.ply")
@@ -87,13 +83,11 @@ def render_sequence(
     return out
 
 
-def automatic_settings(
-    color: ColorConfig, source: FrameSource, writer: SequenceWriter, progress: Progress
-) -> list[Setting]:
-    """How the automatic camera takes all colour frames of its clock, also those that a driver loses."""
-    stamps = writer.stamps("color")
+def automatic_settings(name: str, source: FrameSource, writer: SequenceWriter, progress: Progress) -> list[Setting]:
+    """How an automatic camera takes all frames of its clock, also those that a driver loses."""
+    stamps, color = writer.stamps(name), source.colors[name].config
     gain = color.noise.gain if color.noise.model == "camera" and color.noise.gain > 0 else 1.0
-    meter = source.light_meter(writer.spline, stamps)
+    meter = source.colors[name].light_meter(writer.spline, stamps)
 
     def watched(frame: int, setting: Setting) -> Reading:
         progress("metering", (frame + 1) / len(stamps), f"frame {frame}")
@@ -106,8 +100,8 @@ def automatic_settings(
 def _check_ways(config: Config, motion: TrueMotion, meshes: Sequence[Any], scene: Any) -> None:
     """Raises UserError if an object comes through a camera, or a camera too near to the scene."""
     triangles, names = [mesh.vertices[mesh.faces] for mesh in meshes], [thing.name for thing in config.objects]
-    span, T_color_depth = (motion.first_stamp, motion.last_stamp), np.asarray(config.T_color_depth, float)
-    check_objects_clear(names, motion.objects, triangles, motion.spline, span, T_color_depth)
+    span, cameras = (motion.first_stamp, motion.last_stamp), [config.T_cam_body(name) for name in config.cameras]
+    check_objects_clear(names, motion.objects, triangles, motion.spline, span, cameras)
     least = config.trajectory.clearance_m if config.motion is None else config.motion.clearance_m
     if least is not None:
         check_clearance(motion.spline, scene_triangles(scene), least)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.config.cameras import StreamConfig
+from rsgen.config.cameras import ColorConfig, StreamConfig
 from rsgen.config.config import Backend, Config
 from rsgen.config.motion import ObjectConfig
 from rsgen.config.sections import LightConfig, SceneConfig, TrajectoryConfig
@@ -25,9 +25,10 @@ from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion, with_tremor
 from rsgen.motion.object_paths import object_spline
+from rsgen.produce.camera_sources import Stage
 from rsgen.produce.frame_source import FrameSource
 from rsgen.produce.records import fingerprint
-from rsgen.sequence.format import STREAMS, stream_stamps
+from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
 log = logging.getLogger("rsgen")
@@ -72,7 +73,7 @@ def load_motion(config: Config) -> TrueMotion:
         recorded = fit_spline(trajectory, dt=spacing, smoothing=smoothing)
         trajectory, spacing = with_tremor(recorded.spline, config.tremor, config.seed, trajectory.stamps[[0, -1]])
         smoothing = 0.0
-    before, after = _padding(config.color, config.depth)
+    before, after = _padding(*config.cameras.values())
     fit = fit_spline(trajectory, dt=spacing, smoothing=smoothing, pad_begin_s=before, pad_end_s=after)
     first, last = float(trajectory.stamps[0]), float(trajectory.stamps[-1])
     objects = tuple(object_spline(thing, first, last, before, after) for thing in config.objects)
@@ -80,8 +81,8 @@ def load_motion(config: Config) -> TrueMotion:
 
 
 def sequence_stamps(config: Config, motion: TrueMotion) -> dict[str, FloatArray]:
-    """Stamps (n,) in seconds of all frames of both streams."""
-    return {s: stream_stamps(motion.first_stamp, motion.last_stamp, getattr(config, s)) for s in STREAMS}
+    """Stamps (n,) in seconds of all frames of all streams."""
+    return {s: stream_stamps(motion.first_stamp, motion.last_stamp, stream) for s, stream in config.cameras.items()}
 
 
 def _padding(*streams: StreamConfig) -> tuple[float, float]:
@@ -100,12 +101,12 @@ def _recorded(settings: TrajectoryConfig) -> Trajectory:
 
 
 def lines_of_sight(config: Config) -> tuple[FloatArray, FloatArray]:
-    """What the config's colour camera looks along, at random over picture and recording. Raises UserError."""
+    """What the config's (first) colour camera looks along, at random over picture and recording. Raises UserError."""
     motion = load_motion(config)
-    camera = config.color.camera
+    camera = config.cameras[config.view].camera
     rng = np.random.default_rng(config.seed)
     stamps = rng.uniform(motion.first_stamp, motion.last_stamp, _INSTANTS)
-    T_world_color = motion.spline.pose(stamps) @ se3.inverse(np.asarray(config.T_color_depth, float))
+    T_world_color = motion.spline.pose(stamps) @ se3.inverse(config.T_cam_body(config.view))
     pixels = rng.uniform(-0.5, (camera.width - 0.5, camera.height - 0.5), (_INSTANTS, _INSTANTS, 2))
     ray = camera.unproject(pixels)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -215,9 +216,8 @@ def open_frames(
     mi = mitsuba(config.backend)
     scene = scene or load_scene(config)
     integrator = make_integrator(mi, scene, config, progress, objects)
-    T_color_depth = np.asarray(config.T_color_depth, float)
-    cameras = config.color, config.depth, T_color_depth
-    return FrameSource(scene, integrator, *cameras, config.truth, config.seed, global_shutter, bool(objects))
+    things = integrator.objects if objects else None
+    return FrameSource(Stage(scene, integrator, things, config.seed, global_shutter), config)
 
 
 def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()) -> Any:
@@ -238,7 +238,9 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, obj
         text = str(error)
         raise UserError(text if text.startswith("scene ") else f"scene {config.scene.file}: {text}") from None
     things = _lit_objects(scene, field, load_meshes(config.objects), objects) if objects else None
-    return BakedIntegrator(field, glossy_spp=mirrored_samples(light, config.color.spp), objects=things)
+    view = config.cameras[config.view]
+    spp = view.spp if isinstance(view, ColorConfig) else 1
+    return BakedIntegrator(field, glossy_spp=mirrored_samples(light, spp), objects=things)
 
 
 def mirrored_samples(light: LightConfig, spp: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import BoolArray, FloatArray
-from rsgen.config.cameras import StreamConfig
+from rsgen.config.cameras import ColorConfig, DepthConfig, StreamConfig
 from rsgen.config.config import Config
-from rsgen.config.faults import ImuFaults, StreamFaults, moved_to
+from rsgen.config.faults import ImuFaults, moved_to
 from rsgen.config.imu import ImuConfig
-from rsgen.config.sections import MocapConfig
+from rsgen.config.rig import RigColorConfig, RigDepthConfig
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml
 from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import (
     IMU_TRUTH_CSV,
@@ -36,13 +35,11 @@ from rsgen.sensors.reports import deliver, reported_poses
 from rsgen.sequence.camera_yaml import Cameras
 from rsgen.sequence.format import (
     CLEAN_COLOR,
-    FOLDERS,
     FORMAT,
-    LISTINGS,
     OBJECT_CHANNELS,
     OBJECT_IDS,
+    RIG_FORMAT,
     STREAMS,
-    StreamName,
     associate,
     frame_name,
     ground_truth,
@@ -50,6 +47,7 @@ from rsgen.sequence.format import (
     pose_lines,
     round_stamps,
 )
+from rsgen.sequence.stream_files import FILES, StreamFiles, rig_files
 from rsgen.sequence.truth_files import FrameTable
 
 
@@ -77,9 +75,23 @@ def describe(
     inputs: Mapping[str, str],
 ) -> dict[str, Any]:
     """Content of sequence.yaml. stamps: (n,) s of all frames of each stream."""
+    identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
+    return {
+        **(_rig_yaml(config, stamps) if config.streams else _two_cameras_yaml(config, stamps)),
+        "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
+        "noise": noise_yaml(config),
+        **({"objects": [thing.name for thing in config.objects]} if config.objects else {}),
+        **({} if config.streams else {"truth": _truth_yaml(config, "color")}),
+        "seed": config.seed,
+        **identity,
+        "fingerprint": fingerprint(identity),
+    }
+
+
+def _two_cameras_yaml(config: Config, stamps: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """What sequence.yaml states of cameras in format 1."""
     color, depth, faults = config.declared_color, config.declared_depth, config.injected
     depth_only = {"depth_scale": depth.depth_scale} | ({"registered": True} if depth.registered else {})
-    identity = {"config": config.content(), "inputs": dict(inputs), "versions": dict(versions)}
     return {
         "format": FORMAT,
         "name": config.name,
@@ -87,16 +99,32 @@ def describe(
             "color": _stream_yaml(color, stamps["color"], faults.color is not None),
             "depth": _stream_yaml(depth, stamps["depth"], faults.depth is not None) | depth_only,
         },
-        "T_color_depth": [[float(value) for value in row] for row in config.declared_T_color_depth],
+        "T_color_depth": _rows(config.declared_T_color_depth),
         **({} if faults.declared is None else {"declared": True}),
-        "spline": {"knot_spacing_s": spline.dt, "t0_s": spline.t0, "control_points": len(spline.control_points)},
-        "noise": noise_yaml(config),
-        **({"objects": [thing.name for thing in config.objects]} if config.objects else {}),
-        "truth": {name: list(channels) for name, channels in color_truth(config).items()},
-        "seed": config.seed,
-        **identity,
-        "fingerprint": fingerprint(identity),
     }
+
+
+def _rig_yaml(config: Config, stamps: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """What sequence.yaml states of cameras in format 2."""
+    streams = {}
+    for name, stream in config.streams.items():
+        scale = {"depth_scale": stream.depth_scale} if isinstance(stream, DepthConfig) else {}
+        streams[name] = {
+            "kind": stream.kind,
+            **_stream_yaml(stream, stamps[name], is_faulty=False),
+            **scale,
+            "T_body_cam": _rows(stream.T_body_cam),
+            "truth": _truth_yaml(config, name),
+        }
+    return {"format": RIG_FORMAT, "name": config.name, "streams": streams}
+
+
+def _rows(T: Sequence[Sequence[float]]) -> list[list[float]]:
+    return [[float(value) for value in row] for row in T]
+
+
+def _truth_yaml(config: Config, camera: str) -> dict[str, list[str]]:
+    return {name: list(channels) for name, channels in image_truth(config, camera).items()}
 
 
 def true_cameras(config: Config) -> Cameras:
@@ -106,16 +134,20 @@ def true_cameras(config: Config) -> Cameras:
     return Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)
 
 
-def color_truth(config: Config) -> dict[str, tuple[str, ...]]:
-    """Images in truth/NAME/ for each colour frame with their EXR channels; no channels: an 8-bit sRGB PNG."""
-    clean: dict[str, tuple[str, ...]] = {CLEAN_COLOR: ()} if config.color.noise.model != "none" else {}
+def image_truth(config: Config, camera: str) -> dict[str, tuple[str, ...]]:
+    """Exact images of each frame of a camera, with their EXR channels; no channels: an 8-bit PNG. Depth has its own."""
+    stream = config.cameras[camera]
+    if isinstance(stream, DepthConfig):
+        return {}
+    clean: dict[str, tuple[str, ...]] = {CLEAN_COLOR: ()} if stream.noise.model != "none" else {}
     masks = {OBJECT_IDS: OBJECT_CHANNELS} if config.objects else {}
     return clean | config.truth.images | masks
 
 
 def noise_yaml(config: Config) -> dict[str, str] | None:
-    """Noise models of both streams; None where both are exact."""
-    models: dict[str, str] = {name: getattr(config, name).noise.model for name in STREAMS}
+    """Noise models of all streams; None where they are exact."""
+    models: dict[str, str] = {name: stream.noise.model for name, stream in config.cameras.items()}
+    models |= {name: "stereo" for name, s in config.streams.items() if isinstance(s, RigDepthConfig) and s.stereo}
     return models if set(models.values()) != {"none"} else None
 
 
@@ -179,61 +211,81 @@ def _short(value: Any) -> str:
 
 @dataclass(frozen=True)
 class ListedStream:
-    """One stream that is written; stamps (n,): true ones of its clock; table: what each frame shows, and when."""
+    """One stream that is written; stamps (n,): true ones of its clock; table: what each frame shows, and when.
 
-    camera: Camera
-    shutter: Shutter
+    truth: its exact images beside depth, as `image_truth` has them. image_camera: of the images, where depth is
+    registered the colour camera.
+    """
+
+    config: ColorConfig | DepthConfig
+    files: StreamFiles
+    T_cam_body: FloatArray
+    truth: Mapping[str, tuple[str, ...]]
+    image_camera: Camera
     stamps: FloatArray
     table: FrameTable
     is_delivered: BoolArray
     writes_table: bool
 
     @classmethod
-    def of(
-        cls, stream: StreamConfig, faults: StreamFaults | None, name: StreamName, stamps: npt.ArrayLike, seed: int
-    ) -> ListedStream:
-        stamps = round_stamps(stamps)
-        came = deliver(stamps, faults, seed, name)
+    def of(cls, config: Config, name: str, stamps: npt.ArrayLike) -> ListedStream:
+        stream, stamps = config.cameras[name], round_stamps(stamps)
+        faults = None if config.streams else getattr(config.injected, name)
+        came = deliver(stamps, faults, config.seed, name)
         ones = np.ones(len(stamps))
         table = FrameTable(
             np.arange(len(stamps)), came.shows, stamps[came.shows], came.listed, stream.exposure_s * ones,
             ones, ones, np.ones((len(stamps), 3)),
         )  # fmt: skip
-        return cls(stream.camera, stream.shutter, stamps, table, came.is_delivered, stream.adapts or faults is not None)
+        registered = isinstance(stream, DepthConfig) and stream.registered
+        return cls(
+            stream, rig_files(name) if config.streams else FILES[name], config.T_cam_body(name),
+            image_truth(config, name), config.color.camera if registered else stream.camera, stamps, table,
+            came.is_delivered, stream.adapts or faults is not None,
+        )  # fmt: skip
 
-    def line_poses(self, spline: Spline, T_cam_body: FloatArray | None = None) -> FloatArray:
-        """Rows (frames, lines, 7), as in truth/rows_STREAM.npy. Raises UserError."""
-        table = self.table
+    @property
+    def is_grey(self) -> bool:
+        """Whether its 8-bit images have one channel."""
+        return isinstance(self.config, RigColorConfig) and self.config.kind != "color"
+
+    def line_poses(self, spline: Spline) -> FloatArray:
+        """Rows (frames, lines, 7), as on disk. Raises UserError."""
+        table, stream = self.table, self.config
         return line_poses(
-            spline, self.camera, self.shutter, table.taken_s, T_cam_body,
+            spline, stream.camera, stream.shutter, table.taken_s,
+            None if (self.T_cam_body == np.eye(4)).all() else self.T_cam_body,
             table.exposure_s if self.writes_table else None,
         )  # fmt: skip
 
 
-def write_listings(
-    out: Path, name: str, listed: Mapping[StreamName, FloatArray], written: Mapping[StreamName, list[int]],
-    limit_s: float,
-) -> None:  # fmt: skip
-    """rgb.txt, depth.txt, and the pairs at most limit_s apart. listed (n,): stamps, s; written: frames on disk."""
-    entries = {s: [f"{listed[s][k]:.9f} {FOLDERS[s]}/{frame_name(k)}.png" for k in written[s]] for s in STREAMS}
-    for s in STREAMS:
-        write_lines(out / LISTINGS[s], [f"# {s} images of {name}", "# stamp path", *entries[s]])
-    color, depth = (listed[s][written[s]] for s in STREAMS)
-    pairs = [f"{entries['color'][i]} {entries['depth'][j]}" for i, j in associate(color, depth, limit_s)]
-    write_lines(out / "associations.txt", pairs)
+def write_listings(out: Path, name: str, streams: Mapping[str, ListedStream], written: Mapping[str, list[int]]) -> None:
+    """A listing for each stream, and of a colour and a depth camera the pairs. written: frames on disk."""
+    entries = {
+        s: [f"{stream.table.listed_s[k]:.9f} {stream.files.images}/{frame_name(k)}.png" for k in written[s]]
+        for s, stream in streams.items()
+    }
+    for s, stream in streams.items():
+        write_lines(out / stream.files.listing, [f"# {s} images of {name}", "# stamp path", *entries[s]])
+    if tuple(streams) == STREAMS:
+        color, depth = (streams[s].table.listed_s[written[s]] for s in STREAMS)
+        limit_s = 0.5 / min(stream.config.rate_hz for stream in streams.values())
+        pairs = [f"{entries['color'][i]} {entries['depth'][j]}" for i, j in associate(color, depth, limit_s)]
+        write_lines(out / "associations.txt", pairs)
 
 
 def write_ground_truth(
-    out: Path, name: str, spline: Spline, stamps: Mapping[StreamName, FloatArray], T_image_depth: FloatArray | None,
-    mocap: MocapConfig | None, seed: int,
-) -> None:  # fmt: skip
+    out: Path, config: Config, spline: Spline, stamps: Mapping[str, FloatArray], T_image_depth: FloatArray | None
+) -> None:
     """groundtruth.txt: exact poses, or what a motion capture reports of them.
 
     T_image_depth (4, 4): of the colour camera, where depth is registered, whose poses they then are.
     """
-    camera = "T_world_depth" if T_image_depth is None else "T_world_color, depth being registered"
+    name, mocap, seed = config.name, config.mocap, config.seed
+    body = "T_world_body" if config.streams else "T_world_depth"
+    camera = body if T_image_depth is None else "T_world_color, depth being registered"
     if mocap is None:
-        rows = ground_truth(spline, stamps["color"], stamps["depth"], T_cam_body=T_image_depth)
+        rows = ground_truth(spline, *stamps.values(), T_cam_body=T_image_depth)
     else:
         rows = reported_poses(spline, mocap, seed, T_image_depth)
         camera += ", as a motion capture reports it"

@@ -19,7 +19,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
 from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import ViewContents, free_region
-from rsgen.produce.frame_source import small_camera
+from rsgen.produce.camera_sources import small_camera
 
 REACH_M = 1.0  # surfaces farther off are not reported
 _LARGEST_THING_M = 50.0

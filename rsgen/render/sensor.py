@@ -89,6 +89,13 @@ class RollingShutterSensor(mi.Sensor):
         ray.has_differentials = True
         return ray, weight
 
+    def axes(self, time, sample2):
+        """The camera's x, y and z axes in the world at `time` after the lines at film positions `sample2` opened."""
+        camera = self.camera
+        line = self._line(sample2.x * camera.width - 0.5, sample2.y * camera.height - 0.5)
+        _, rotate = self._pose(time + line * self.shutter.line_delay(camera))
+        return tuple(rotate(mi.Vector3f(*axis)) for axis in np.eye(3).tolist())
+
     def planar_depth_scale(self, u, v):
         """Planar z per unit of ray length at pixel positions (u, v): the ray direction's z in the camera's frame."""
         return dr.normalize(self._direction(u, v)).z

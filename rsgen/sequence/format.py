@@ -1,19 +1,18 @@
-"""What writer and reader of a sequence folder agree on: names, sequence.yaml, stamps, pairs, and poses as TUM rows.
+"""What writer and reader of a sequence folder agree on: sequence.yaml, stamps, pairs, and poses as TUM rows.
 
-The format is `rsgen-sequence/1` of the design document, section 2.
+Format 1 has two cameras, colour and depth; format 2 a rig of any cameras with their poses in a body (docs/format.md).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError, first_problem
@@ -23,24 +22,24 @@ from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 
-FORMAT = "rsgen-sequence/1"
+FORMAT, RIG_FORMAT = "rsgen-sequence/1", "rsgen-sequence/2"
 _FORMAT_NAME = FORMAT.partition("/")[0] + "/"
-StreamName = Literal["color", "depth"]
-STREAMS: tuple[StreamName, StreamName] = ("color", "depth")
-FOLDERS: dict[StreamName, str] = {"color": "rgb", "depth": "depth"}
-LISTINGS: dict[StreamName, str] = {"color": "rgb.txt", "depth": "depth.txt"}
-ROWS: dict[StreamName, str] = {"color": "truth/rows_color.npy", "depth": "truth/rows_depth.npy"}
-FRAME_TABLES: dict[StreamName, str] = {"color": "truth/frames_color.txt", "depth": "truth/frames_depth.txt"}
-TRUTH_DEPTH = "truth/depth"
+StreamName = str
+StreamKind = Literal["color", "mono", "infrared", "depth"]
+IMAGE_KINDS = ("color", "mono", "infrared")  # which first, where one is to be chosen
+STREAMS = ("color", "depth")  # of format 1
 OBJECTS = "truth/objects"  # splines, poses and meshes of things that move by themselves
-OBJECT_IDS = "object_ids"  # truth/object_ids/: which of them each pixel of a colour frame shows, 0 for none
-DEPTH_OBJECT_IDS = "truth/depth_object_ids"  # the same of depth frames
+OBJECT_IDS = "object_ids"  # exact image: which of them each pixel of a colour frame shows, 0 for none
 OBJECT_CHANNELS = ("id",)
-CLEAN_COLOR = "color"  # truth/color/: what a colour camera without noise would have reported
+CLEAN_COLOR = "color"  # exact image: what a colour camera without noise would have reported
 GROUND_TRUTH_HZ = 200.0
 DEPTH_SCALE = 5000.0  # units per metre of depth images, unless stated otherwise: as TUM's and ICL-NUIM's
 STAMP_TOLERANCE_S = 1e-6
 _FRAMES_AT_ONCE = 16  # poses of so many frames' lines are evaluated together: flat memory, little overhead
+
+MOST_CAMERAS = 16
+# A camera's name is that of its folder and of its listing: these are of the format itself, or of exports beside it.
+_RESERVED = ("truth", "associations", "groundtruth", "imu", "kalibr", "mav0", "scene", "sequence", "spline")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
@@ -68,7 +67,7 @@ class StreamYaml(_Yaml):
     first_stamp_s: Seconds
     depth_scale: Annotated[float, Field(ge=1e-3, le=1e9)] | None = None
     registered: bool = False  # depth/ holds images warped into the colour camera
-    frame_table: bool = False  # stamps, exposure or gain of each image are in FRAME_TABLES
+    frame_table: bool = False  # stamps, exposure or gain of each image are in a table of their own
 
     @property
     def camera(self) -> Camera:
@@ -88,20 +87,47 @@ class _Streams(_Yaml):
 
 
 Vector4 = tuple[Finite, Finite, Finite, Finite]
+Pose = tuple[Vector4, Vector4, Vector4, Vector4]
+TruthImages = dict[Annotated[str, Field(pattern=r"^[a-z_]+$")], tuple[str, ...]]
 
 
-class SequenceYaml(_Yaml):
-    """The part of sequence.yaml that a reader relies on."""
+def _not_reserved(name: str) -> str:
+    if name in _RESERVED:
+        raise ValueError(f"{name!r} is a name of the format's own files: choose another")
+    return name
 
-    format: Literal["rsgen-sequence/1"]
+
+CameraName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$"), AfterValidator(_not_reserved)]
+
+
+class RigStreamYaml(StreamYaml):
+    """One camera of a rig: what it is, its pose in the body, and its exact images."""
+
+    kind: StreamKind
+    T_body_cam: Pose
+    truth: TruthImages = {}
+
+
+class _Description(_Yaml):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]  # part of file names
-    streams: _Streams
-    T_color_depth: tuple[Vector4, Vector4, Vector4, Vector4]
     noise: Any = None
     declared: bool = False  # cameras are what the sequence claims; truth/cameras.yaml has those that took the images
     objects: tuple[Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")], ...] = ()  # names; ids count from 1
-    truth: dict[Annotated[str, Field(pattern=r"^[a-z_]+$")], tuple[str, ...]] = {}
     fingerprint: str  # the file's last entry: one that was cut off has none
+
+
+class SequenceYaml(_Description):
+    """The part of sequence.yaml that a reader relies on, format 1."""
+
+    streams: _Streams
+    T_color_depth: Pose
+    truth: TruthImages = {}
+
+
+class RigYaml(_Description):
+    """The part of sequence.yaml that a reader relies on, format 2."""
+
+    streams: Annotated[dict[CameraName, RigStreamYaml], Field(min_length=1, max_length=MOST_CAMERAS)]
 
 
 class FrameClock(Protocol):
@@ -149,21 +175,17 @@ def frame_name(k: int) -> str:
     return f"{k:06d}"
 
 
-def color_truth_path(name: str, channels: Sequence[str], stem: str) -> str:
-    """File of an image of `truth/` within the folder; without EXR channels it is a PNG."""
-    return f"truth/{name}/{stem}.{'exr' if channels else 'png'}"
-
-
-def read_sequence_yaml(path: Path) -> tuple[SequenceYaml, dict[str, Any]]:
+def read_sequence_yaml(path: Path) -> tuple[SequenceYaml | RigYaml, dict[str, Any]]:
     """sequence.yaml, validated and as it is. Raises UserError naming the wrong field."""
     data = read_yaml(path)
-    if data.get("format") != FORMAT:
-        found = data.get("format")
+    models: dict[Any, type[SequenceYaml | RigYaml]] = {FORMAT: SequenceYaml, RIG_FORMAT: RigYaml}
+    found = data.get("format")
+    if not isinstance(found, str) or found not in models:
         newer = isinstance(found, str) and found.startswith(_FORMAT_NAME)
         cure = "install a newer rsgen" if newer else f"is this a sequence of rsgen? It begins with 'format: {FORMAT}'"
-        raise UserError(f"{path}: format is {found!r}, this version of rsgen reads {FORMAT!r}: {cure}")
+        raise UserError(f"{path}: format is {found!r}, this version of rsgen reads {FORMAT!r} and {RIG_FORMAT!r}: {cure}")
     try:
-        return SequenceYaml.model_validate(data), data
+        return models[found].model_validate(data), data
     except ValidationError as error:
         raise UserError(f"{path}: {first_problem(error)} ({error.error_count()} wrong in all)") from None
 

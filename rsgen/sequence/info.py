@@ -8,24 +8,23 @@ import numpy as np
 
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
-from rsgen.sequence.format import STREAMS
-from rsgen.sequence.reader import read_sequence
+from rsgen.sequence.reader import read_rig
 
 
 def sequence_info(path: Path) -> str:
     """Text for `rsgen info`: what is in a sequence folder. Raises UserError."""
-    sequence = read_sequence(path)
+    sequence = read_rig(path)
     knots = sequence.spline
     rows = [("name", sequence.name)]
-    for name in STREAMS:
-        s = sequence.streams[name]
+    for name, s in sequence.streams.items():
         delay = s.shutter.line_delay(s.camera)
         frames = f"{len(s.paths)} frames" if len(s.paths) == s.frames else f"{len(s.paths)} of {s.frames} frames"
         span = f", {s.stamps[0]:.3f} to {s.stamps[-1]:.3f} s" if len(s.paths) else ""
         scale = f", {s.depth_scale:g} units per metre" if s.depth_scale else ""
+        kind = "" if name == s.kind else f"{s.kind}, "
         c = s.camera
         rows += [
-            (name, f"{frames} at {s.rate_hz:g} Hz{span}"),
+            (name, f"{kind}{frames} at {s.rate_hz:g} Hz{span}"),
             ("", f"{c.width}x{c.height} {c.model}, fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g}{scale}"),
             ("", _shutter_text(s.shutter, delay)),
         ]

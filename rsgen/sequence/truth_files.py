@@ -14,7 +14,7 @@ from rsgen.files import read_text
 from rsgen.geometry import se3
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.spline import Spline
-from rsgen.sequence.format import FRAME_TABLES, OBJECTS, STAMP_TOLERANCE_S, StreamName
+from rsgen.sequence.format import OBJECTS, STAMP_TOLERANCE_S
 
 _TABLE_HEAD = "# frame shows taken_s listed_s exposure_s gain brightness red green blue"
 _COLUMNS = 10
@@ -52,9 +52,8 @@ class FrameTable:
         return "\n".join([_TABLE_HEAD, *lines, ""])
 
 
-def read_frame_table(root: Path, stream: StreamName) -> FrameTable:
-    """The table of a stream of the sequence at `root`. Raises UserError naming the file."""
-    path = root / FRAME_TABLES[stream]
+def read_frame_table(path: Path) -> FrameTable:
+    """The table of a stream. Raises UserError naming the file."""
     lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     try:
         rows = np.array([[float(field) for field in line.split()] for line in lines])

@@ -12,7 +12,7 @@ from rsgen.config.imu import ImuConfig
 from rsgen.config.sections import MocapConfig, TargetConfig
 from rsgen.errors import UserError, first_problem
 from rsgen.sensors.imu import ImuSamples, simulate_imu
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import Rig
 
 SectionT = TypeVar("SectionT", bound=BaseModel)
 
@@ -25,7 +25,7 @@ class SequenceImu(NamedTuple):
     faults: ImuFaults
 
 
-def sequence_imu(sequence: Sequence) -> SequenceImu | None:
+def sequence_imu(sequence: Rig) -> SequenceImu | None:
     """The IMU of a sequence; None where it has none.
 
     Equal to what imu.csv was written from. Raises UserError if sequence.yaml's config.imu is not one.
@@ -38,7 +38,7 @@ def sequence_imu(sequence: Sequence) -> SequenceImu | None:
     return SequenceImu(imu, simulate_imu(spline, imu, spline.t_begin, spline.t_end, seed, faults), faults)
 
 
-def sequence_mocap(sequence: Sequence) -> tuple[MocapConfig, int] | None:
+def sequence_mocap(sequence: Rig) -> tuple[MocapConfig, int] | None:
     """The motion capture of a sequence's groundtruth.txt and the sequence's seed; None where the poses are exact.
 
     Raises UserError if sequence.yaml's config.mocap is not one.
@@ -46,7 +46,7 @@ def sequence_mocap(sequence: Sequence) -> tuple[MocapConfig, int] | None:
     return _section(sequence, "mocap", MocapConfig)
 
 
-def sequence_target(sequence: Sequence) -> TargetConfig | None:
+def sequence_target(sequence: Rig) -> TargetConfig | None:
     """The calibration target in a sequence's scene; None where there is none.
 
     Raises UserError if sequence.yaml's config.target is not one.
@@ -56,7 +56,7 @@ def sequence_target(sequence: Sequence) -> TargetConfig | None:
 
 
 def _section(
-    sequence: Sequence, name: str, model: type[SectionT], part: Callable[[dict[str, Any]], Any] = dict
+    sequence: Rig, name: str, model: type[SectionT], part: Callable[[dict[str, Any]], Any] = dict
 ) -> tuple[SectionT, int] | None:
     """A section of the config in sequence.yaml, or a part of it, and the seed; None where there is no such section.
 

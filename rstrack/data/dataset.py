@@ -21,7 +21,7 @@ from rsgen.array_types import Float32Array, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import DEPTH_SCALE
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import Sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, camera_content, run_cameras
 from rstrack.data.estimate import INFO

@@ -21,7 +21,8 @@ from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry import se3
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 
 # Triangles are cut until no edge is longer (m): then few of them can hold a point's nearest.
 _LONGEST_EDGE = 0.04

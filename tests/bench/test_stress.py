@@ -102,7 +102,8 @@ def render(words: Sequence[str]) -> None:
     if config.trajectory.file is not None and config.trajectory.file.exists():
         spline = fit_spline(read_trajectory(config.trajectory.file), config.trajectory.knot_spacing_s).spline
     stamps = [stream_stamps(0.0, 1.2, stream)[frames] for stream in (config.color, config.depth)]
-    writer = SequenceWriter.open(out, config, spline, stamps[0], stamps[1], {"synthetic": "1"}, {"scene": "box"})
+    both = {"color": stamps[0], "depth": stamps[1]}
+    writer = SequenceWriter.open(out, config, spline, both, {"synthetic": "1"}, {"scene": "box"})
     shutter, exposure = config.color.shutter, config.color.exposure_s
     rows = np.arange(HEIGHT)
     for k in writer.missing("color"):

@@ -11,7 +11,8 @@ import synthetic
 import yaml
 
 from rsgen.geometry import se3
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 
 T_IMU_DEPTH = se3.exp(np.array([0.12, -0.05, 0.07, 0.4, -1.1, 0.6]))
 IMU: dict[str, Any] = {

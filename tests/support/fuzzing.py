@@ -20,7 +20,7 @@ import tiny
 import yaml
 
 from rsgen.config.config import Config, describe_fields
-from rsgen.produce.records import color_truth
+from rsgen.produce.records import image_truth
 
 # No field takes any of these.
 NEVER: tuple[Any, ...] = (
@@ -252,7 +252,7 @@ def make_sequence(root: Path, frames: int = 4) -> Path:
         T_color_depth = np.array(config.T_color_depth)
         image = synthetic.render_color(writer.spline, config.color.camera, config.color.shutter, stamp, T_color_depth)
         truth: dict[str, Any] = {}
-        for name, channels in color_truth(config).items():
+        for name, channels in image_truth(config, "color").items():
             planes = (len(channels),) if len(channels) > 1 else ()
             truth[name] = rng.random((36, 48, *planes)).astype(np.float32) if channels else image
         writer.write_color(k, image, truth)

@@ -109,7 +109,8 @@ def open_writer(root: Path, config: Config, frames: int = 6, spline: Spline | No
     """The writer of the sequence's first `frames` frames."""
     color, depth = (stream_stamps(0.0, DURATION_S, stream)[:frames] for stream in (config.color, config.depth))
     spline = spline or make_spline()
-    return SequenceWriter.open(root, config, spline, color, depth, {"synthetic": "1"}, {"scene": "box"})
+    stamps = {"color": color, "depth": depth}
+    return SequenceWriter.open(root, config, spline, stamps, {"synthetic": "1"}, {"scene": "box"})
 
 
 def write_frames(writer: SequenceWriter, frames: range | None = None) -> None:

@@ -20,7 +20,7 @@ from rsgen.formats.export.shared import DEFAULTS, ExportOptions, make_folders, n
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import pose_rows
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import Sequence
 
 
 def export_colmap(

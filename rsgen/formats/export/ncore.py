@@ -23,7 +23,7 @@ from rsgen.files import read_bytes, write_error
 from rsgen.formats.export import poses
 from rsgen.formats.export.shared import DEFAULTS, EPOCH_S, ExportOptions, image_streams, new_folder
 from rsgen.geometry import se3
-from rsgen.sequence.reader import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Sequence
 
 INSTALL = "pip install 'rolling-shutter-rgbd[ncore]'"
 ENDS, DENSE = "start and end pose of an image", "the pose of each line"

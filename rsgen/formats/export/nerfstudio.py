@@ -35,7 +35,7 @@ from rsgen.formats.export.shared import (
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import Sequence
 
 GSPLAT, NGP, VELOCITY = "start and end pose in gsplat", "in instant-ngp", "constant velocity in 3dgs-deblur"
 _MODELS = {"pinhole": "PINHOLE", "radtan": "OPENCV", "fisheye": "OPENCV_FISHEYE"}

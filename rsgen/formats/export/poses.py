@@ -20,7 +20,7 @@ from rsgen.geometry import se3, so3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.sensors.imu import nanoseconds
-from rsgen.sequence.reader import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Sequence
 
 PIXEL_SHIFT = 0.5
 """What COLMAP's and nerfstudio's pixel coordinates are larger by: their pixel centres are at halves."""

@@ -19,7 +19,7 @@ from rsgen.sensors.depth import register_depth
 from rsgen.sensors.reports import reported_poses
 from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
 from rsgen.sequence.format import associate, ground_truth, pose_lines
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import Sequence
 from rsgen.truth.settings import sequence_mocap
 
 _MARK = "registered to the colour camera"

@@ -19,7 +19,7 @@ from rsgen.files import read_bytes
 from rsgen.formats.export.shared import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
-from rsgen.sequence.reader import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Sequence
 from rsgen.truth.settings import sequence_imu
 
 TIMELINE = "time"

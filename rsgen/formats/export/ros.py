@@ -31,7 +31,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
 from rsgen.sequence.format import ground_truth, pose_rows, poses_of_rows
-from rsgen.sequence.reader import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Sequence
 from rsgen.truth.settings import SequenceImu, sequence_imu
 
 COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (f"camera_{name}_optical_frame" for name in ("color", "depth", "imu"))

@@ -19,7 +19,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
-from rsgen.sequence.reader import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Sequence
 
 Storage = Literal["sqlite3", "mcap"]
 EPOCH_S = 1_000_000_000

@@ -13,7 +13,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import whole_file
 from rsgen.formats.export.shared import DEFAULTS, ExportOptions, new_file
-from rsgen.sequence.reader import Sequence
+from rsgen.sequence.images import Sequence
 
 # Encoders that OpenCV's own wheels bring along.
 _CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
@@ -30,7 +30,7 @@ def export_video(
     options.scene: the scene's file, if it has moved since the sequence was rendered.
     """
     from rsgen.pictures.frames import config_of
-    from rsgen.produce.frame_source import setting_of
+    from rsgen.produce.camera_sources import setting_of
     from rsgen.produce.parts import open_frames
 
     sequence = sequence.as_taken
@@ -41,7 +41,7 @@ def export_video(
     middle = 0.5 * (stream.line_count - 1) * stream.shutter.line_delay(stream.camera)
     frames = range(len(stream.paths))
     left = (
-        source.color(sequence.spline, stamp + middle, int(k), setting_of(config.color, stream.table, i))
+        source.color.picture(sequence.spline, stamp + middle, int(k), setting_of(config.color, stream.table, i))
         for i, (stamp, k) in enumerate(zip(stream.stamps, stream.indices, strict=True))
     )
     right = (sequence.color(k) for k in frames)

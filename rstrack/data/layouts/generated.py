@@ -16,7 +16,8 @@ import numpy as np
 
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
 from rstrack.data.dataset import Dataset, group_colors

@@ -174,9 +174,7 @@ def allow_failures(count: int, dask_scheduler: Any) -> int:
 def plan(config: Config) -> SequenceRecipe:
     motion = load_motion(config)
     stamps = sequence_stamps(config, motion)
-    return SequenceRecipe(
-        config, motion.spline, stamps["color"], stamps["depth"], engine_versions(config.backend), input_hashes(config)
-    )
+    return SequenceRecipe(config, motion.spline, stamps, engine_versions(config.backend), input_hashes(config))
 
 
 def test_a_worker_that_would_render_something_else_says_so(plan: SequenceRecipe, tmp_path: Path) -> None:

@@ -28,7 +28,8 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import exact_imu
 from rsgen.sequence.format import pose_rows
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 from rsgen.truth.settings import sequence_imu
 
 

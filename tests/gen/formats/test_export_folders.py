@@ -24,7 +24,8 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.depth import register_depth
 from rsgen.sequence.format import STREAMS
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.data.dataset import open_dataset
 

@@ -26,7 +26,8 @@ from rsgen.image_codecs import read_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
 from rsgen.sequence.format import poses_of_rows
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 RADTAN = (-0.05, 0.02, 0.001, -0.002)

@@ -15,7 +15,8 @@ from rsgen.formats.export import poses
 from rsgen.formats.export.ncore import ENDS, export_ncore, frame_times_us
 from rsgen.formats.export.poses import Observations, observations
 from rsgen.formats.export.shared import EPOCH_S
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 
 LENSES: dict[str, list[float]] = {
     "pinhole": [],

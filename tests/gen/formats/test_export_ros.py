@@ -23,7 +23,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import ground_truth, poses_of_rows
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 from rsgen.truth.settings import sequence_imu
 
 KINDS: list[tuple[str, Storage, str]] = [

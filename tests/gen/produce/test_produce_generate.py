@@ -25,7 +25,7 @@ from rsgen.config.config import load_config
 from rsgen.console.command_line import parse_frames
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
-from rsgen.produce.frame_source import FrameSource
+from rsgen.produce.camera_sources import ColorSource
 from rsgen.produce.generate import render_sequence
 from rsgen.produce.parts import load_motion, open_frames
 from rsgen.sequence.reader import read_sequence
@@ -176,15 +176,15 @@ def test_a_killed_render_resumes_to_the_same_bytes(folder: Path, tmp_path: Path)
 def test_an_interrupted_render_leaves_a_readable_shorter_sequence(
     config: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    expose = FrameSource.expose_color
+    expose = ColorSource.expose
 
-    def interrupted(self: FrameSource, spline: Any, stamp: float, frame: int, *more: Any) -> Any:
+    def interrupted(self: ColorSource, spline: Any, stamp: float, frame: int, *more: Any) -> Any:
         if frame == 4:
             raise KeyboardInterrupt
         return expose(self, spline, stamp, frame, *more)
 
     with monkeypatch.context() as patch:
-        patch.setattr(FrameSource, "expose_color", interrupted)
+        patch.setattr(ColorSource, "expose", interrupted)
         assert render(config, tmp_path / "seq") == 130
     assert capfd.readouterr().err == "rsgen: interrupted; the same command resumes\n"
     assert read_sequence(tmp_path / "seq").streams["color"].indices.tolist() == [0, 1, 2, 3]
@@ -225,8 +225,8 @@ def test_frames_depend_neither_on_order_nor_on_threads(config: Path, whole: Path
             dr.set_thread_count(count)
             for k in reversed(range(FRAMES)):
                 stamp = float(sequence.streams["color"].stamps[k])
-                np.testing.assert_array_equal(source.color(sequence.spline, stamp, k), sequence.color(k))
-                np.testing.assert_array_equal(source.depth(sequence.spline, stamp), sequence.truth_depth(k))
+                np.testing.assert_array_equal(source.color.picture(sequence.spline, stamp, k), sequence.color(k))
+                np.testing.assert_array_equal(source.depth.exact(sequence.spline, stamp), sequence.truth_depth(k))
     finally:
         dr.set_thread_count(threads)
 
@@ -235,7 +235,7 @@ def test_seeds_and_frames_have_noise_of_their_own(config: Path, whole: Path) -> 
     sequence = read_sequence(whole)
     stamp = float(sequence.streams["color"].stamps[0])
     linear = [
-        open_frames(load_config(config, {"seed": seed})).linear_color(sequence.spline, stamp, frame)
+        open_frames(load_config(config, {"seed": seed})).color.linear(sequence.spline, stamp, frame)
         for seed, frame in (("0", 0), ("0", 1), ("1", 0))
     ]
     for a, b in ((0, 1), (0, 2), (1, 2)):
@@ -299,8 +299,8 @@ def test_variants_verify(folder: Path, tmp_path: Path, name: str) -> None:
 
 def test_baked_and_path_traced_pictures_look_alike(folder: Path, whole: Path) -> None:
     path = load_config(tiny.write_config(folder, FRAMES, "both", light={"mode": "path"}, color={"spp": 256}))
-    sequence, traced = read_sequence(whole), open_frames(path).linear_color(load_motion(path).spline, 0.0, 0)
-    baked = open_frames(load_config(folder / "tiny.yaml")).linear_color(sequence.spline, 0.0, 0)
+    sequence, traced = read_sequence(whole), open_frames(path).color.linear(load_motion(path).spline, 0.0, 0)
+    baked = open_frames(load_config(folder / "tiny.yaml")).color.linear(sequence.spline, 0.0, 0)
     assert np.abs(baked.mean() / traced.mean() - 1) < 0.2  # one bounce of nine, coarse
     assert np.corrcoef(baked.mean(-1).ravel(), traced.mean(-1).ravel())[0, 1] > 0.9
 

@@ -95,7 +95,7 @@ def test_a_frame_without_one_of_its_images_is_rendered_again(config: Path, whole
 def test_images_of_truth_are_those_of_their_frame(config: Path, whole: Path) -> None:
     sequence, loaded = read_sequence(whole), load_config(config)
     stamps = sequence.streams["color"].stamps
-    shot = open_frames(loaded).expose_color(sequence.spline, float(stamps[4]), 4, float(stamps[5]))
+    shot = open_frames(loaded).color.expose(sequence.spline, float(stamps[4]), 4, float(stamps[5]))
     assert set(shot.truth) | {"color"} == set(sequence.truth_images)
     for name, image in shot.truth.items():
         np.testing.assert_array_equal(sequence.truth(name, 4), image)

@@ -123,12 +123,13 @@ def test_other_inputs_versions_or_frame_counts_are_refused(seq: Path) -> None:
     config, spline = synthetic.make_config(), synthetic.make_spline()
     stamps = stream_stamps(0.0, synthetic.DURATION_S, config.color)[:FRAMES]
     good: dict[str, Any] = {"versions": {"synthetic": "1"}, "inputs": {"scene": "box"}}
-    SequenceWriter.open(seq, config, spline, stamps, stamps, **good)
+    both = {"color": stamps, "depth": stamps}
+    SequenceWriter.open(seq, config, spline, both, **good)
     for change, name in (({"versions": {"synthetic": "2"}}, "versions.synthetic"), ({"inputs": {}}, "inputs.scene")):
         with pytest.raises(UserError, match=name):
-            SequenceWriter.open(seq, config, spline, stamps, stamps, **(good | change))
+            SequenceWriter.open(seq, config, spline, both, **(good | change))
     with pytest.raises(UserError, match=r"streams\.depth\.frames is 4 there and 3 now"):
-        SequenceWriter.open(seq, config, spline, stamps, stamps[:-1], **good)
+        SequenceWriter.open(seq, config, spline, both | {"depth": stamps[:-1]}, **good)
 
 
 def test_folders_that_cannot_be_used_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,9 +196,8 @@ def test_a_full_disk_loses_nothing_and_the_run_resumes(
 def test_a_frame_outside_the_spline_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     config = synthetic.make_config()
     with pytest.raises(UserError, match="outside"):
-        SequenceWriter.open(
-            tmp_path / "seq", config, synthetic.make_spline(), np.array([0.0, 5.0]), np.array([0.0]), {}, {}
-        )
+        stamps = {"color": np.array([0.0, 5.0]), "depth": np.array([0.0])}
+        SequenceWriter.open(tmp_path / "seq", config, synthetic.make_spline(), stamps, {}, {})
     assert not (tmp_path / "seq").exists()
 
 

@@ -137,7 +137,7 @@ def test_verify_notices_wrong_masks_poses_and_motions(whole: Path, tmp_path: Pat
 def test_blur_is_the_mean_of_sharp_pictures_over_the_exposure(config: Path) -> None:
     loaded = load_config(config, {"color.spp": "64", "color.readout_s": "0.01"})
     made = load_motion(loaded)
-    color = open_frames(loaded, objects=made.objects)._color
+    color = open_frames(loaded, objects=made.objects).color._color
     rest = constant_twist(np.zeros(6), made.spline.pose(np.array([0.06]))[0])  # only the things blur
     got = color.render(rest, 0.06, 1)
     mean = np.mean([color.render(rest, 0.06 - 0.03 * (k + 0.5) / 12, k, 0.0) for k in range(12)], axis=0)

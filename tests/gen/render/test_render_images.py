@@ -211,27 +211,28 @@ def config_for(room: Path, **color: Any) -> Config:
 def test_frame_source_renders_both_streams_with_their_own_cameras(room: Path) -> None:
     config = config_for(room, exposure_s=0.01, exposure_gain=0.7)
     spline = synthetic.make_spline()
-    source = parts.open_frames(config)
+    scene = parts.load_scene(config)
+    source = parts.open_frames(config, scene=scene)
     np.testing.assert_array_equal(
-        source.depth(spline, STAMP),
-        DepthRenderer(source.scene, config.depth.camera, config.depth.shutter).render(spline.pose, STAMP),
+        source.depth.exact(spline, STAMP),
+        DepthRenderer(scene, config.depth.camera, config.depth.shutter).render(spline.pose, STAMP),
     )
-    linear = source.linear_color(spline, STAMP, frame=2)
+    linear = source.color.linear(spline, STAMP, frame=2)
     T_depth_color = np.linalg.inv(synthetic.T_COLOR_DEPTH)
     expected = np.stack(
         [
-            color(source.scene, config.color.shutter, 64, config.color.camera).render(
+            color(scene, config.color.shutter, 64, config.color.camera).render(
                 lambda t: spline.pose(t) @ T_depth_color, STAMP, s
             )
             for s in range(4)
         ]
     )
-    frames = np.stack([source.linear_color(spline, STAMP, frame=k) for k in range(8)])
+    frames = np.stack([source.color.linear(spline, STAMP, frame=k) for k in range(8)])
     assert 0.7 < z_spread(frames, expected) < 1.3
     np.testing.assert_array_equal(linear, frames[2])
     assert np.mean(frames[2] != frames[3]) > 0.9
-    np.testing.assert_array_equal(source.color(spline, STAMP, 2), to_srgb8(linear, 0.7))
-    other_seed = parts.open_frames(config.model_copy(update={"seed": 5})).linear_color(spline, STAMP, 2)
+    np.testing.assert_array_equal(source.color.picture(spline, STAMP, 2), to_srgb8(linear, 0.7))
+    other_seed = parts.open_frames(config.model_copy(update={"seed": 5})).color.linear(spline, STAMP, 2)
     assert np.mean(other_seed != linear) > 0.9
 
 
@@ -245,5 +246,5 @@ def test_a_global_shutter_frame_source_is_that_of_a_config_without_readout(room:
     )
     spline = synthetic.make_spline()
     twin, plain = parts.open_frames(config, global_shutter=True), parts.open_frames(no_readout)
-    np.testing.assert_array_equal(twin.depth(spline, STAMP), plain.depth(spline, STAMP))
-    np.testing.assert_array_equal(twin.linear_color(spline, STAMP, 1), plain.linear_color(spline, STAMP, 1))
+    np.testing.assert_array_equal(twin.depth.exact(spline, STAMP), plain.depth.exact(spline, STAMP))
+    np.testing.assert_array_equal(twin.color.linear(spline, STAMP, 1), plain.color.linear(spline, STAMP, 1))

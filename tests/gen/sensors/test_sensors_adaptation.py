@@ -15,8 +15,8 @@ from rsgen.config.cameras import AutoExposureConfig, AutoWhiteBalanceConfig, Col
 from rsgen.config.config import load_config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
+from rsgen.produce.camera_sources import setting_of
 from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
-from rsgen.produce.frame_source import setting_of
 from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
 from rsgen.sensors.color import Reading, Setting, adapt, apply_color_noise, apply_setting, reading
 from rsgen.sequence.reader import read_sequence
@@ -173,8 +173,8 @@ def test_a_worker_takes_frames_as_the_whole_did(config: Path, whole: Path) -> No
     table = read_sequence(whole).streams["color"].table
     settings = [setting_of(loaded.color, table, k) for k in range(12)]
     plan = SequenceRecipe(
-        loaded, motion.spline, stamps["color"], stamps["depth"], engine_versions(loaded.backend), input_hashes(loaded),
-        tuple(s for s in settings if s is not None),
+        loaded, motion.spline, stamps, engine_versions(loaded.backend), input_hashes(loaded),
+        {"color": tuple(s for s in settings if s is not None)},
     )  # fmt: skip
     files = render_block(RenderJob(plan, ((10, "color"),)), no_progress)
     assert len(files) == 5 and all((whole / name).read_bytes() == data for name, data in files.items())

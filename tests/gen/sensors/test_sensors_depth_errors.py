@@ -136,10 +136,10 @@ def test_it_is_what_the_colour_camera_sees(whole: Path) -> None:
 
 def test_blur_of_depth_is_that_of_its_exposure(config: Path, whole: Path) -> None:
     spline, stamp = read_sequence(whole).spline, 2 / 30
-    shot = open_frames(load_config(config)).expose_depth(spline, stamp, 2)
+    shot = open_frames(load_config(config)).depth.expose(spline, stamp, 2)
     assert shot.blurred is not None
     sharp = open_frames(load_config(config, {"depth.exposure_s": "0", "depth.blur_samples": "1"}))
-    samples = [sharp.depth(spline, stamp - 0.02 + 0.004 * (k + 0.5)) for k in range(5)]
+    samples = [sharp.depth.exact(spline, stamp - 0.02 + 0.004 * (k + 0.5)) for k in range(5)]
     np.testing.assert_allclose(samples[2], shot.z, rtol=1e-6)
     expected = 1 / np.mean([1 / z.astype(float) for z in samples], axis=0)
     assert np.isclose(shot.blurred, expected, rtol=1e-5).mean() > 0.99  # the rest are edges

@@ -25,10 +25,12 @@ RGB = RNG.integers(0, 256, (24, 32, 3), dtype=np.uint8)
 UNITS = RNG.integers(0, 65536, (24, 32), dtype=np.uint16)
 Z = RNG.random((24, 32), dtype=np.float32) * 5
 ROWS = RNG.random((3, 24, 7))
+GREY = RNG.integers(0, 256, (24, 32), dtype=np.uint8)
 
 # name, bytes, reader
 KINDS: list[tuple[str, bytes, Callable[[Path], np.ndarray], np.ndarray]] = [
     ("rgb.png", codecs.encode_png(RGB), lambda p: codecs.read_png(p, RGB.shape, np.uint8), RGB),
+    ("grey.png", codecs.encode_png(GREY), lambda p: codecs.read_png(p, GREY.shape, np.uint8), GREY),
     ("depth.png", codecs.encode_png(UNITS), lambda p: codecs.read_png(p, UNITS.shape, np.uint16), UNITS),
     ("z.exr", codecs.encode_exr(Z), lambda p: codecs.read_exr(p, Z.shape), Z),
     ("rows.npy", codecs.encode_npy(ROWS), lambda p: codecs.read_npy(p, ROWS.shape), ROWS),

@@ -61,7 +61,7 @@ def test_what_is_missing_is_named(seq: Path) -> None:
 @pytest.mark.parametrize(
     ("edit", "parts"),
     [
-        (lambda y: y.update(format="rsgen-sequence/2"), ["rsgen-sequence/2", "rsgen-sequence/1", "install a newer"]),
+        (lambda y: y.update(format="rsgen-sequence/3"), ["rsgen-sequence/3", "rsgen-sequence/1", "install a newer"]),
         (lambda y: y.update(format=3), ["format is 3", "rsgen-sequence/1", "is this a sequence"]),
         (lambda y: y.pop("streams"), ["streams"]),
         (lambda y: y["streams"].pop("depth"), ["streams.depth"]),

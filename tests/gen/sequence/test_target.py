@@ -22,7 +22,8 @@ from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.produce.parts import load_scene, scene_hash, surfaces_hash
 from rsgen.render.board import Board, drawing, surface
 from rsgen.render.meshes import mesh_arrays
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.truth_files import TARGET_CORNERS
 
 # The tiny room's y points down: the board stands upright in it and looks at the camera.

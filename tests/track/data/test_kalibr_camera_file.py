@@ -16,7 +16,8 @@ from rsgen.errors import UserError
 from rsgen.formats.export.kalibr import export_kalibr
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
-from rsgen.sequence.reader import Sequence, read_sequence
+from rsgen.sequence.images import Sequence
+from rsgen.sequence.reader import read_sequence
 from rstrack.data.camera_file import RigFile, read_rig
 from rstrack.data.dataset import open_dataset
 from rstrack.data.imu.description import read_imu_yaml
