@@ -41,7 +41,9 @@ def encode_png(image: np.ndarray) -> bytes:
     elif image.ndim == 2 and image.dtype in (np.uint8, np.uint16):
         ok, data = cv2.imencode(".png", image, _PNG_DEPTH if image.dtype == np.uint16 else _PNG_COLOR)
     else:
-        raise ValueError(f"a PNG is written from (h, w, 3) uint8 or (h, w) uint8 or uint16, not {image.shape} {image.dtype}")
+        raise ValueError(
+            f"a PNG is written from (h, w, 3) uint8 or (h, w) uint8 or uint16, not {image.shape} {image.dtype}"
+        )
     if not ok:
         raise ValueError("cv2 could not encode a PNG")
     return data.tobytes()
@@ -82,7 +84,7 @@ def encode_npz(arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.ndarray:
-    """An RGB (h, w, 3) uint8, grey (h, w) uint8 or (h, w) uint16 PNG of exactly that shape and type. Raises UserError."""
+    """An RGB (h, w, 3) uint8, or (h, w) uint8 or uint16 PNG of exactly that shape and type. Raises UserError."""
     data = read_bytes(path)
     if (fault := png_fault(data)) is not None:
         raise _damaged(path, "PNG", fault)

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from rsgen.console.command_line import Quiet, refuse_options
 from rsgen.errors import UserError
-from rsgen.formats import EXPORTS, exporter
+from rsgen.formats import EXPORTS, OF_RIGS, exporter
 
 SequenceFolder = Annotated[Path, "folder that 'rsgen render' wrote"]
 SceneFile = Annotated[Path | None, "scene file, if it has moved since the sequence was rendered"]
@@ -155,16 +155,19 @@ def export(
     copy: Annotated[bool, "euroc, registered, kalibr, colmap, nerfstudio: copy images instead of linking them"] = False,
     scene: Annotated[Path | None, "video: scene file, if it has moved since the sequence was rendered"] = None,
     storage: Annotated[Storage, "ros2: what the bag is stored in"] = "sqlite3",
+    color: Annotated[str | None, "of a rig, where one colour camera is exported: its name (default: the first)"] = None,
+    depth: Annotated[str | None, "of a rig, where one depth camera is exported: its name (default: the first)"] = None,
     quiet: Quiet = False,
 ) -> int:
     """Write a sequence in the layout of other tools."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.formats.export.shared import ExportOptions
-    from rsgen.sequence.reader import read_sequence
+    from rsgen.sequence.reader import read_rig, read_sequence
 
     options = ExportOptions(to, copy, scene, storage)
     with ProgressDisplay(quiet) as progress:
-        recorded = read_sequence(sequence)
+        is_whole = to in OF_RIGS and color is None and depth is None
+        recorded = read_rig(sequence) if is_whole else read_sequence(sequence, color, depth)
         place = sequence / EXPORTS[to][1].format(recorded.name)
         done = exporter(to)(recorded, out or place, options, progress)
     print(done)

@@ -33,7 +33,7 @@ class DotsConfig(Section):
         default=0.15, description="width of a dot (full width at half maximum), deg"
     )
     power: Annotated[float, limits(0, 1e6, "(factor)")] = Field(
-        default=0.3, description="light of a dot's middle on a white wall 1 m away, 1 = white"
+        default=3.0, description="light of a dot's middle on a white wall 1 m away, 1 = white"
     )
 
 
@@ -43,7 +43,7 @@ class StereoConfig(Section):
     left: str = Field(description="camera whose pixels the depth image has")
     right: str = Field(description="the other one: the same lens, beside it along its x axis")
     disparities: int = Field(default=128, ge=16, le=1024, multiple_of=16, description="largest disparity, px")
-    block_px: int = Field(default=5, ge=1, le=21, description="size of the window that is compared, px, odd")
+    block_px: int = Field(default=7, ge=1, le=21, description="size of the window that is compared, px, odd")
     uniqueness_pct: int = Field(default=10, ge=0, le=100, description="by how much the best match must beat the rest")
     speckle_px: int = Field(default=100, ge=0, le=100_000, description="smaller islands of disparity are left out, px")
 

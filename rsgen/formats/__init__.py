@@ -7,6 +7,8 @@ from importlib import import_module
 from typing import Any
 
 _BAG = "a bag with images, IMU, tf and the lines' times"
+# Exports that take all cameras of a rig; the others take one colour and one depth camera of it.
+OF_RIGS = ("kalibr", "euroc", "ros1", "ros2", "mcap", "ncore", "rerun")
 # Exports: module with a function export_MODULE, place within the sequence's folder ({} is its name), help.
 EXPORTS = {
     "kalibr": ("kalibr", "kalibr", "camchain.yaml with line_delay, imu.yaml, of a target also target.yaml and images"),

@@ -175,10 +175,14 @@ class Spline:
         blocks = self._left_blocks(segment, b) if side == "left" else self._right_blocks(segment, b)
         return segment + self.first, np.stack(blocks, axis=-3)
 
+    def arrays(self) -> dict[str, FloatArray]:
+        """What a file of it holds, by name, as `load` reads it."""
+        return {"control_points": self.control_points, "t0": np.array(self.t_begin), "dt": np.array(self.dt)}
+
     def save(self, path: str | Path) -> None:
         """Write control_points, t0 and dt to an .npz file (float64, so that `load` returns the very same spline)."""
         with Path(path).open("wb") as file:
-            np.savez(file, control_points=self.control_points, t0=np.float64(self.t_begin), dt=np.float64(self.dt))
+            np.savez(file, allow_pickle=False, **self.arrays())
 
     @classmethod
     def load(cls, path: str | Path) -> Spline:

@@ -20,6 +20,7 @@ from rsgen.files import read_yaml
 from rsgen.produce.camera_sources import setting_of
 from rsgen.produce.generate import ORIGIN
 from rsgen.produce.parts import open_frames, scene_hash
+from rsgen.sequence.format import RIG_FORMAT
 from rsgen.sequence.reader import read_sequence
 
 if TYPE_CHECKING:
@@ -86,6 +87,8 @@ def compare_frame(
 
 def config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
     """The config that a sequence records, with its scene and its objects' meshes found on this machine."""
+    if meta.get("format") == RIG_FORMAT:
+        raise UserError(f"{path}: is of a rig, of which no frame is rendered again: take a sequence of two cameras")
     origin = read_yaml(path / ORIGIN) if (path / ORIGIN).is_file() else {}
     recorded = _mapping(meta.get("config"))
     file = scene or Path(str(origin.get("scene", "")))

@@ -97,7 +97,7 @@ class ColorSource:
         self._truth = TruthRenderer(stage.scene, stage.integrator, config, truth, stage.objects) if wanted else None
         self._dots = None
         if isinstance(config, RigColorConfig) and config.dots is not None:
-            from rsgen.render.dots import DotProjector
+            from rsgen.sensors.dots import DotProjector
 
             self._dots = DotProjector(stage.scene, config.camera, shutter, config.dots, stage.seed, stage.objects)
 

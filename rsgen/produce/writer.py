@@ -248,7 +248,7 @@ class SequenceWriter:
 def _folders(stream: ListedStream, has_objects: bool) -> list[str]:
     """Of a stream's images, within the sequence's folder."""
     files = stream.files
-    folders = [files.images, *(f"{files.truth}/{name}" for name in stream.truth)]
+    folders = [files.images, files.truth, *(f"{files.truth}/{name}" for name in stream.truth)]
     if isinstance(stream.config, DepthConfig):
         folders += [files.exact_depth, *([files.object_ids] if has_objects else [])]
     return folders
@@ -270,8 +270,7 @@ def quantise(z: Float32Array, depth_scale: float) -> npt.NDArray[np.uint16]:
 
 def _stored_spline(path: Path, spline: Spline) -> Spline:
     if not path.exists():
-        arrays = {"control_points": spline.control_points, "t0": np.array(spline.t0), "dt": np.array(spline.dt)}
-        atomic_write(path, encode_npz(arrays))
+        atomic_write(path, encode_npz(spline.arrays()))
         return spline
     stored = Spline.load(path)
     same = stored.t0 == spline.t0 and stored.dt == spline.dt

@@ -183,7 +183,9 @@ def read_sequence_yaml(path: Path) -> tuple[SequenceYaml | RigYaml, dict[str, An
     if not isinstance(found, str) or found not in models:
         newer = isinstance(found, str) and found.startswith(_FORMAT_NAME)
         cure = "install a newer rsgen" if newer else f"is this a sequence of rsgen? It begins with 'format: {FORMAT}'"
-        raise UserError(f"{path}: format is {found!r}, this version of rsgen reads {FORMAT!r} and {RIG_FORMAT!r}: {cure}")
+        raise UserError(
+            f"{path}: format is {found!r}, this version of rsgen reads {FORMAT!r} and {RIG_FORMAT!r}: {cure}"
+        )
     try:
         return models[found].model_validate(data), data
     except ValidationError as error:

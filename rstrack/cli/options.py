@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from rsgen.console.command_line import number
 from rstrack.metrics import consistency
 
-SequenceFolder = Annotated[Path, "rsgen sequence, TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
+SequenceFolder = Annotated[Path, "rsgen sequence (of a rig DIR:COLOR,DEPTH), TUM RGB-D, ICL-NUIM or 7-Scenes folder"]
 CameraFile = Annotated[Path | None, "camera file to use in place of the cameras that the folder states", "FILE"]
 ImuFile = Annotated[
     Path | None,

@@ -216,22 +216,34 @@ class Dataset:
 def open_dataset(path: Path, camera_file: Path | None = None, imu_file: Path | None = None) -> Dataset:
     """Read the description and listings of a folder; images are read when asked for.
 
-    path: a folder of one of the layouts in `rstrack.data.layouts`.
+    path: a folder of one of the layouts in `rstrack.data.layouts`; of a rig, FOLDER:COLOR,DEPTH names two of its
+      cameras, which otherwise are the first of either kind.
     camera_file: the cameras, instead of those of a sequence.yaml, camera.yaml or calibration.yaml in the folder;
       see `rstrack.data.camera_file`.
     imu_file: what describes the IMU, see `rstrack.data.imu.description`; without it the IMU is read when asked for.
     Raises UserError, one line: what is missing or wrong, where, and how to mend it.
     """
-    root = Path(path)
+    root, cameras = _folder_and_cameras(Path(path))
     if not root.is_dir():
         raise UserError(f"{root}: no such folder: give {' or '.join(LAYOUTS)}")
     layout: Any = import_module(layout_of(root))
-    found: Dataset = layout.read(root, camera_file)
+    found: Dataset = layout.read(root, camera_file, *cameras)
     meta = found.images.meta if isinstance(found.images, Sequence) else None
-    found = replace(found, imu_files=find_imu(root, imu_file, meta))
+    found = replace(found, root=Path(path), imu_files=find_imu(root, imu_file, meta))
     if imu_file is not None:
         _ = found.read_imu  # what was named has to be right
     return found
+
+
+def _folder_and_cameras(path: Path) -> tuple[Path, tuple[str, ...]]:
+    """A folder, and the names of a colour and a depth camera if they are given behind a colon. Raises UserError."""
+    if path.exists() or ":" not in path.name:
+        return path, ()
+    root, _, words = str(path).rpartition(":")
+    names = tuple(words.split(","))
+    if len(names) != 2 or not (Path(root) / "sequence.yaml").exists():
+        raise UserError(f"{path}: no such folder; of an rsgen sequence with several cameras, name two: DIR:COLOR,DEPTH")
+    return Path(root), names
 
 
 def open_tracked(path: Path, run: Path, info: dict[str, Any], camera_file: Path | None = None) -> Dataset:

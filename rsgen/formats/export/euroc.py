@@ -1,18 +1,20 @@
 """A sequence as an EuRoC/ASL folder `mav0/` (Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016).
 
     mav0/body.yaml
-    mav0/cam0/    data/STAMP.png (colour), data.csv, sensor.yaml
-    mav0/depth0/  data/STAMP.png (16-bit), data.csv, sensor.yaml
+    mav0/cam0/    data/STAMP.png (colour), data.csv, sensor.yaml       cam1 ... of a rig
+    mav0/depth0/  data/STAMP.png (16-bit), data.csv, sensor.yaml       depth1 ... of a rig
     mav0/imu0/    data.csv, sensor.yaml                                where the sequence has an IMU
     mav0/state_groundtruth_estimate0/  data.csv, sensor.yaml           pose, velocity and biases of the body
 
-The body is the IMU, without one the depth camera. EuRoC has one stamp an image and no time of a row: the stamp stays
-ours, the end of line 0's exposure, and sensor.yaml has an entry of our own, `rolling_shutter`, with the rest. The world
-is the sequence's: gravity need not point along −z as in EuRoC's own sets; `body.yaml` has it.
+The body is the IMU, without one the sequence's: the depth camera, or the body of a rig. EuRoC has one stamp an image
+and no time of a row: the stamp stays ours, the end of line 0's exposure, and sensor.yaml has an entry of our own,
+`rolling_shutter`, with the rest. The world is the sequence's: gravity need not point along −z as in EuRoC's own sets;
+`body.yaml` has it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from rsgen.formats.export.shared import (
     DEFAULTS,
     EPOCH_S,
     ExportOptions,
+    counted,
     four_coefficients,
     image_streams,
     make_folders,
@@ -36,7 +39,7 @@ from rsgen.formats.export.shared import (
 from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
 from rsgen.sequence.format import ground_truth, pose_rows
-from rsgen.sequence.images import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Rig, Sequence
 from rsgen.truth.settings import sequence_imu
 
 _MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"} | dict.fromkeys(
@@ -52,7 +55,7 @@ _TRUTH_HEADER = (
 
 
 def export_euroc(
-    sequence: Sequence,
+    sequence: Rig,
     out: Path,
     options: ExportOptions = DEFAULTS,
     progress: Progress = no_progress,
@@ -66,8 +69,11 @@ def export_euroc(
     imu = sequence_imu(sequence)
     T_depth_body = imu.config.T_depth_imu() if imu else np.eye(4)
     root = Path(out) / "mav0"
-    streams = zip(("cam0", "depth0"), image_streams(sequence), strict=True)
-    sensors = {name: (stream, se3.inverse(T @ T_depth_body)) for name, (stream, T) in streams}
+    streams = image_streams(sequence)
+    sensors = {
+        name: (streams[own], se3.inverse(streams[own].T_cam_body @ T_depth_body))
+        for name, own in sensor_names(streams).items()
+    }
     described = {name: _camera_yaml(stream, T_BS) for name, (stream, T_BS) in sensors.items()}
     stamps = {name: nanoseconds(stream.listed, epoch_s) for name, (stream, _) in sensors.items()}
     times = imu.samples.t if imu else ground_truth(sequence.spline)[:, 0]
@@ -95,13 +101,22 @@ def export_euroc(
         atomic_write(root / name / "data.csv", "\n".join(["#timestamp [ns],filename", *rows, ""]).encode())
         atomic_write(root / name / "sensor.yaml", encode_yaml(described[name]))
         targets = [root / name / "data" / file for file in files]
-        place_images(stream.paths, targets, options.copy, progress, (0.5 * k, 0.5 * (k + 1)))
-    counts = f"{len(stamps['cam0'])} colour and {len(stamps['depth0'])} depth images"
-    return f"{root}: {counts}, {f'{len(times)} IMU samples' if imu else 'no IMU'}, stamps + {epoch_s} s"
+        part = k / len(sensors), (k + 1) / len(sensors)
+        place_images(stream.paths, targets, options.copy, progress, part)
+    return f"{root}: {counted(streams)}, {f'{len(times)} IMU samples' if imu else 'no IMU'}, stamps + {epoch_s} s"
+
+
+def sensor_names(streams: Mapping[str, ImageStream]) -> dict[str, str]:
+    """EuRoC's names of sensors, cam0 ... and depth0 ..., each with that of its stream."""
+    names: dict[str, str] = {}
+    for kind, is_depth in (("cam", False), ("depth", True)):
+        of_kind = [name for name, stream in streams.items() if stream.is_depth == is_depth]
+        names |= {f"{kind}{k}": name for k, name in enumerate(of_kind)}
+    return names
 
 
 def truth_csv(
-    sequence: Sequence, t: FloatArray, T_depth_body: FloatArray, imu: ImuSamples | None, epoch_s: int = 0
+    sequence: Rig, t: FloatArray, T_depth_body: FloatArray, imu: ImuSamples | None, epoch_s: int = 0
 ) -> bytes:
     """EuRoC's ground truth at times t (n,) s: the body's pose, its velocity in the world, and the IMU's biases.
 
@@ -157,8 +172,8 @@ def _imu_yaml(imu: ImuConfig) -> dict[str, Any]:
     }
 
 
-def _body_yaml(sequence: Sequence, imu: ImuConfig | None, epoch_s: int) -> dict[str, Any]:
-    frame = "the IMU" if imu else "the depth camera"
+def _body_yaml(sequence: Rig, imu: ImuConfig | None, epoch_s: int) -> dict[str, Any]:
+    frame = "the IMU" if imu else "the depth camera" if isinstance(sequence, Sequence) else "that of the rig"
     data: dict[str, Any] = {"comment": f"rsgen {sequence.name}: the body is {frame}", "epoch_s": epoch_s}
     return data | ({"gravity": list(imu.gravity)} if imu else {})
 

@@ -28,24 +28,22 @@ from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import nanoseconds, write_imu_csv
-from rsgen.sequence.images import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Rig
 from rsgen.truth.settings import SequenceImu, sequence_imu, sequence_target
 
-COLOR_TOPIC, DEPTH_TOPIC, IMU_TOPIC = "/cam0/image_raw", "/cam1/image_raw", "/imu0"
+IMU_TOPIC = "/imu0"
 _MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}
 
 
-def export_kalibr(
-    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
-) -> str:
+def export_kalibr(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress) -> str:
     """Write camchain.yaml, and imu.yaml where the sequence has an IMU, into the new folder `out`; returns one line.
 
-    Where a target is in the scene, also target.yaml, colour's images as cam0/STAMP.png and imu0.csv, their stamps
-    EPOCH_S later. Images are hard links, or copies with options.copy.
-    cam0 is the colour camera, cam1 the depth camera. line_delay: s from one row to the next (negative from bottom to
-    top). timeshift_cam_imu takes a stamp to row 0's mid-exposure (t_imu = t_cam + shift): row v is exposed at
-    stamp + timeshift_cam_imu + v · line_delay. Raises UserError for what Kalibr has no words for (k3, columns read one
-    by one), and if `out` is there and not empty.
+    Where a target is in the scene, also target.yaml, images of colour (cam0/STAMP.png) or of a rig's colour and grey
+    cameras, and imu0.csv, their stamps EPOCH_S later. Images are hard links, or copies with options.copy.
+    cam0 is the colour camera, cam1 the depth camera; of a rig they are its cameras in their order. line_delay: s from
+    one row to the next (negative from bottom to top). timeshift_cam_imu takes a stamp to row 0's mid-exposure
+    (t_imu = t_cam + shift): row v is exposed at stamp + timeshift_cam_imu + v · line_delay. Raises UserError for what
+    Kalibr has no words for (k3, columns read one by one), and if `out` is there and not empty.
     """
     imu, target = sequence_imu(sequence), sequence_target(sequence)
     chain = camchain(sequence, imu)
@@ -59,11 +57,13 @@ def export_kalibr(
         note = f"; Kalibr itself refuses a {zero[0]} of 0" if zero else ""
     if target:
         atomic_write(out / "target.yaml", encode_yaml(target_yaml(target.grid)))
-        color = sequence.streams["color"]
-        make_folders(out / "cam0")
-        targets = [out / "cam0" / f"{ns}.png" for ns in nanoseconds(color.listed, EPOCH_S)]
-        place_images(color.paths, targets, options.copy, progress)
-        written += ["target.yaml", f"cam0/ with {len(targets)} images"]
+        written.append("target.yaml")
+        for name, stream in zip(chain, sequence.streams.values(), strict=True):
+            if not stream.is_depth:
+                make_folders(out / name)
+                targets = [out / name / f"{ns}.png" for ns in nanoseconds(stream.listed, EPOCH_S)]
+                place_images(stream.paths, targets, options.copy, progress)
+                written.append(f"{name}/ with {len(targets)} images")
         if imu:
             write_imu_csv(out / "imu0.csv", imu.samples, EPOCH_S)
             written.append("imu0.csv")
@@ -82,21 +82,21 @@ def target_yaml(grid: AprilGrid) -> dict[str, Any]:
     }
 
 
-def camchain(sequence: Sequence, imu: SequenceImu | None) -> dict[str, Any]:
+def camchain(sequence: Rig, imu: SequenceImu | None) -> dict[str, Any]:
     """Content of camchain.yaml; with extrinsics and time shift to the IMU where there is one. Raises UserError."""
-    color, depth = sequence.streams["color"], sequence.streams["depth"]
-    T_depth_color = se3.inverse(sequence.T_color_depth)
-    cameras = {
-        "cam0": _camera(color, COLOR_TOPIC) | {"cam_overlaps": [1]},
-        "cam1": _camera(depth, DEPTH_TOPIC) | {"cam_overlaps": [0], "T_cn_cnm1": _matrix(T_depth_color)},
-    }
-    if imu is not None:
-        T_depth_imu = imu.config.T_depth_imu()
-        for name, stream, T_cam_depth in (("cam0", color, sequence.T_color_depth), ("cam1", depth, None)):
-            T_cam_imu = T_depth_imu if T_cam_depth is None else T_cam_depth @ T_depth_imu
+    streams = list(sequence.streams.values())
+    cameras: dict[str, Any] = {}
+    for k, stream in enumerate(streams):
+        others = [i for i in (k - 1, k + 1) if 0 <= i < len(streams)]
+        cameras[f"cam{k}"] = _camera(stream, f"/cam{k}/image_raw") | {"cam_overlaps": others}
+        if k:
+            before = streams[k - 1]
+            cameras[f"cam{k}"] |= {"T_cn_cnm1": _matrix(stream.T_cam_body @ se3.inverse(before.T_cam_body))}
+        if imu is not None:
+            T_cam_imu = stream.T_cam_body @ imu.config.T_depth_imu()
             first_s, _ = row_clock(stream.name, stream.camera, stream.shutter)
             shift = first_s + imu.faults.clock_offset_s
-            cameras[name] |= {"T_cam_imu": _matrix(T_cam_imu), "timeshift_cam_imu": shift}
+            cameras[f"cam{k}"] |= {"T_cam_imu": _matrix(T_cam_imu), "timeshift_cam_imu": shift}
     return cameras
 
 

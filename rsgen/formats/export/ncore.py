@@ -21,9 +21,9 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import read_bytes, write_error
 from rsgen.formats.export import poses
-from rsgen.formats.export.shared import DEFAULTS, EPOCH_S, ExportOptions, image_streams, new_folder
+from rsgen.formats.export.shared import DEFAULTS, EPOCH_S, ExportOptions, counted, image_streams, new_folder
 from rsgen.geometry import se3
-from rsgen.sequence.images import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Rig, Sequence
 
 INSTALL = "pip install 'rolling-shutter-rgbd[ncore]'"
 ENDS, DENSE = "start and end pose of an image", "the pose of each line"
@@ -31,23 +31,21 @@ _STEP_US = 500  # a hand turns by nothing that is not straight meanwhile: 0.001 
 Times = npt.NDArray[np.uint64]
 
 
-def export_ncore(
-    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
-) -> str:
+def export_ncore(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress) -> str:
     """Write the new folder `out`; returns one line. Cameras and poses are the true ones.
 
     Raises UserError if nvidia-ncore is not installed, it has no such lens, `out` is not empty, or a file cannot be read
     or written.
     """
     v4, data = _library()
-    sequence = sequence.as_taken
-    streams = dict(zip(("color", "depth"), image_streams(sequence), strict=True))
-    models = {name: _model(data, stream) for name, (stream, _) in streams.items()}
-    frames = {name: frame_times_us(stream) for name, (stream, _) in streams.items()}
+    sequence = sequence.as_taken if isinstance(sequence, Sequence) else sequence
+    streams = image_streams(sequence)
+    models = {name: _model(data, stream) for name, stream in streams.items()}
+    frames = {name: frame_times_us(stream) for name, stream in streams.items()}
     first, last = (int(f([f(times) for times in frames.values()])) for f in (np.min, np.max))
     times = np.append(np.arange(first, last, _STEP_US), last).astype(np.uint64)
     T_world_rig = sequence.spline.pose(times.astype(float) * 1e-6 - EPOCH_S)
-    losses = _losses(sequence)
+    losses = _losses(sequence) if isinstance(sequence, Sequence) else {}
 
     new_folder(out)
     facts = poses.shutter_facts(sequence, losses) | {"epoch_s": EPOCH_S}
@@ -59,9 +57,9 @@ def export_ncore(
         rig, intrinsics, masks, boxes = (writer.register_component_writer(kind.Writer, "default") for kind in kinds)
         boxes.store_observations([])
         rig.store_dynamic_pose("rig", "world", _with_exact_row(T_world_rig), times)
-        count, done = sum(len(stream.paths) for stream, _ in streams.values()), 0
-        for name, (stream, T_cam_rig) in streams.items():
-            rig.store_static_pose(name, "rig", _with_exact_row(se3.inverse(T_cam_rig)))
+        count, done = sum(len(stream.paths) for stream in streams.values()), 0
+        for name, stream in streams.items():
+            rig.store_static_pose(name, "rig", _with_exact_row(se3.inverse(stream.T_cam_body)))
             intrinsics.store_camera_intrinsics(name, models[name])
             masks.store_camera_masks(name, {})
             about = {"depth_units_per_metre": stream.depth_scale} if stream.depth_scale else {}
@@ -76,8 +74,7 @@ def export_ncore(
         if isinstance(error, OSError):
             raise write_error(out, error) from None
         raise
-    counts = f"{len(streams['color'][0].paths)} colour and {len(streams['depth'][0].paths)} depth images"
-    return f"{path}: {counts}, stamps + {EPOCH_S} s; {poses.loss_words(losses)}"
+    return f"{path}: {counted(streams)}, stamps + {EPOCH_S} s; {poses.loss_words(losses)}"
 
 
 def frame_times_us(stream: ImageStream) -> Times:

@@ -15,12 +15,13 @@ import numpy as np
 
 from rsgen.array_types import ByteArray, FloatArray, IntArray
 from rsgen.console.progress import Progress
-from rsgen.files import atomic_write, read_bytes
+from rsgen.files import atomic_write
 from rsgen.geometry import se3, so3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter, project_rolling
+from rsgen.image_codecs import encode_npz
 from rsgen.sensors.imu import nanoseconds
-from rsgen.sequence.images import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Rig, Sequence
 
 PIXEL_SHIFT = 0.5
 """What COLMAP's and nerfstudio's pixel coordinates are larger by: their pixel centres are at halves."""
@@ -168,8 +169,8 @@ def _loss(error: FloatArray) -> Loss:
 FORMAT = "rsgen-rolling-shutter/1"
 
 
-def shutter_facts(sequence: Sequence, losses: dict[str, Loss]) -> dict[str, Any]:
-    """Shutters of both streams, their images' stamps, and what a format's poses lose against the spline, for JSON."""
+def shutter_facts(sequence: Rig, losses: dict[str, Loss]) -> dict[str, Any]:
+    """Shutters of all streams, their images' stamps, and what a format's poses lose against the spline, for JSON."""
     return {
         "format": FORMAT,
         "sequence": sequence.name,
@@ -178,9 +179,15 @@ def shutter_facts(sequence: Sequence, losses: dict[str, Loss]) -> dict[str, Any]
         "pose_of_line": "at the middle of its window",
         "line_of_pixel": "top-bottom: i = v; bottom-top: i = n - 1 - v; left-right: i = u; right-left: i = n - 1 - u",
         "streams": {name: _stream_facts(stream) for name, stream in sequence.streams.items()},
-        "T_color_depth": sequence.T_color_depth.tolist(),
+        **_extrinsics(sequence),
         "loss_px": {name: loss.as_dict() for name, loss in losses.items()},
     }
+
+
+def _extrinsics(sequence: Rig) -> dict[str, Any]:
+    if isinstance(sequence, Sequence):
+        return {"T_color_depth": sequence.T_color_depth.tolist()}
+    return {"T_cam_body": {name: stream.T_cam_body.tolist() for name, stream in sequence.streams.items()}}
 
 
 def shutter_type(shutter: Shutter) -> str:
@@ -191,7 +198,7 @@ def shutter_type(shutter: Shutter) -> str:
 def write_shutter_files(sequence: Sequence, out: Path, losses: dict[str, Loss]) -> None:
     """Write rolling_shutter.json and spline.npz, from which every line's pose follows. Raises UserError."""
     atomic_write(out / "rolling_shutter.json", json.dumps(shutter_facts(sequence, losses), indent=1).encode())
-    atomic_write(out / "spline.npz", read_bytes(sequence.root / "spline.npz"))
+    atomic_write(out / "spline.npz", encode_npz(sequence.spline.arrays()))
 
 
 def _stream_facts(stream: ImageStream) -> dict[str, Any]:
@@ -220,7 +227,9 @@ def _stream_facts(stream: ImageStream) -> dict[str, Any]:
 
 
 def loss_words(losses: dict[str, Loss]) -> str:
-    """The losses as the end of the line that an export prints."""
+    """The losses as the end of the line that an export prints; none are stated of a rig."""
+    if not losses:
+        return "poses of the spline"
     return "against the spline: " + "; ".join(f"{name} {loss}" for name, loss in losses.items())
 
 

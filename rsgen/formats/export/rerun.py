@@ -19,7 +19,7 @@ from rsgen.files import read_bytes
 from rsgen.formats.export.shared import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
-from rsgen.sequence.images import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Rig, Sequence
 from rsgen.truth.settings import sequence_imu
 
 TIMELINE = "time"
@@ -27,9 +27,7 @@ _UP = {(0, 1): "X_DOWN", (0, -1): "X_UP", (1, 1): "Y_DOWN", (1, -1): "Y_UP", (2,
 _PATH_COLOR, _SCENE_COLOR = [230, 120, 30], [190, 190, 190]
 
 
-def export_rerun(
-    sequence: Sequence, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress
-) -> str:
+def export_rerun(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, progress: Progress = no_progress) -> str:
     """Write the recording `out` (.rrd), whole or not at all; returns one line. Timeline "time": the sequence's seconds.
 
     Raises UserError if rerun-sdk is not installed, if `out` is there already or not named .rrd, or a file of the
@@ -37,11 +35,11 @@ def export_rerun(
     """
     out = Path(out)
     with recording_file(out, "rsgen", sequence.name, "--out") as (rr, recording):
-        _log(rr, recording, sequence.as_taken, progress)
+        _log(rr, recording, sequence.as_taken if isinstance(sequence, Sequence) else sequence, progress)
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB, open it with 'rerun {out.name}'"
 
 
-def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> None:
+def _log(rr: Any, recording: Any, sequence: Rig, progress: Progress) -> None:
     imu = sequence_imu(sequence)
     gravity = np.array(imu.config.gravity) if imu else np.zeros(3)
     axis = int(np.argmax(np.abs(gravity)))
@@ -57,9 +55,9 @@ def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> Non
             times = [rr.TimeColumn(TIMELINE, duration=imu.samples.t)]
             recording.send_columns(f"imu/{name}", times, rr.Scalars.columns(scalars=getattr(imu.samples, name)))
 
-    color, depth = image_streams(sequence)
-    count = len(color[0].paths) + len(depth[0].paths)
-    for (stream, T_cam_depth), first in ((color, 0), (depth, len(color[0].paths))):
+    streams, done = image_streams(sequence), 0
+    count = sum(len(stream.paths) for stream in streams.values())
+    for stream in streams.values():
         where, camera = f"world/{stream.name}", stream.camera
         pinhole = rr.Pinhole(
             image_from_camera=camera.K,
@@ -68,7 +66,7 @@ def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> Non
             image_plane_distance=0.2,
         )
         recording.log(where, pinhole, static=True)
-        poses = _middle_poses(sequence, stream, T_cam_depth)
+        poses = _middle_poses(sequence, stream)
         for k, file in enumerate(stream.paths):
             recording.set_time(TIMELINE, duration=float(stream.stamps[k]))
             recording.log(where, rr.Transform3D(translation=poses[k, :3, 3], mat3x3=poses[k, :3, :3]))
@@ -78,14 +76,15 @@ def _log(rr: Any, recording: Any, sequence: Sequence, progress: Progress) -> Non
             else:
                 picture = rr.EncodedImage(contents=data, media_type="image/png")
             recording.log(f"{where}/image", picture)
-            progress("export", (first + k + 1) / count, file.name)
+            done += 1
+            progress("export", done / count, file.name)
 
 
-def _middle_poses(sequence: Sequence, stream: ImageStream, T_cam_depth: FloatArray) -> FloatArray:
+def _middle_poses(sequence: Rig, stream: ImageStream) -> FloatArray:
     """T_world_cam (n, 4, 4) of the frames in the middle of their readout."""
     middle = 0.5 * (stream.line_count - 1)
     times = stream.shutter.line_mid_time(stream.stamps, middle, stream.camera)
-    return np.asarray(sequence.spline.pose(times) @ se3.inverse(T_cam_depth))
+    return np.asarray(sequence.spline.pose(times) @ se3.inverse(stream.T_cam_body))
 
 
 def _log_scene(rr: Any, recording: Any, path: Path) -> None:

@@ -4,8 +4,9 @@
     /camera/depth/image_rect_raw, camera_info    32FC1, m, NaN = nothing measured; 16UC1, mm, of a depth_scale of 1000
     /camera/aligned_depth_to_color/image_raw, ...  instead, where depth is registered
     /camera/imu                                    where the sequence has an IMU
-    /tf, /ground_truth/pose                        exact T_world_depth, 200 Hz and at every image's true stamp
+    /tf, /ground_truth/pose                        exact T_world_depth (T_world_body of a rig), 200 Hz and at stamps
     /tf_static                                     depth to colour camera, and to the IMU
+    /camera/NAME/image_raw (image_rect_raw of depth), camera_info   of every camera of a rig; mono8 of grey ones
     /camera/rolling_shutter, /ground_truth/spline  latched JSON (std_msgs/String): line times; control points
 
 Stamps are the sequence's listed ones in nanoseconds: the end of line 0's exposure. Needs rosbags, an optional extra.
@@ -26,16 +27,16 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.formats.export.bag import TF, Bag, new_bag
 from rsgen.formats.export.poses import Loss, between, loss_of_poses, loss_words, observations, shutter_facts
-from rsgen.formats.export.shared import ExportOptions, image_streams
+from rsgen.formats.export.shared import ExportOptions, counted, image_streams
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
 from rsgen.sequence.format import ground_truth, pose_rows, poses_of_rows
-from rsgen.sequence.images import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Rig, Sequence
 from rsgen.truth.settings import SequenceImu, sequence_imu
 
 COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (f"camera_{name}_optical_frame" for name in ("color", "depth", "imu"))
-WORLD_FRAME = "world"
+WORLD_FRAME, BODY_FRAME = "world", "body"
 COLOR_TOPIC, DEPTH_TOPIC = "/camera/color/image_raw", "/camera/depth/image_rect_raw"
 ALIGNED_TOPIC = "/camera/aligned_depth_to_color/image_raw"
 IMU_TOPIC, SHUTTER_TOPIC = "/camera/imu", "/camera/rolling_shutter"
@@ -45,7 +46,7 @@ _LOSS = "tf, interpolated"
 Message = tuple[int, Callable[[], None]]
 
 
-def export_ros(sequence: Sequence, out: Path, options: ExportOptions, progress: Progress = no_progress) -> str:
+def export_ros(sequence: Rig, out: Path, options: ExportOptions, progress: Progress = no_progress) -> str:
     """Write the bag `out`, whole or not at all; returns one line.
 
     options.name: ros1 for a .bag, ros2 for a folder, mcap for a file; options.storage: sqlite3 or mcap, of ros2.
@@ -54,26 +55,31 @@ def export_ros(sequence: Sequence, out: Path, options: ExportOptions, progress: 
     is there or named otherwise, a stamp is negative, or a file cannot be read or written.
     """
     imu = sequence_imu(sequence)
-    color, depth = image_streams(sequence)
-    truth = ground_truth(sequence.spline, color[0].stamps, depth[0].stamps)
-    losses = {_LOSS: loss_of_tf(sequence, truth)}
-    facts = shutter_facts(sequence, losses) | {"poses": "T_world_depth of tf and pose, T_depth_color of tf_static"}
-    with new_bag(out, options, min(color[0].listed[0], depth[0].listed[0])) as bag:
-        start = max(0, min(nanoseconds([color[0].listed[0], depth[0].listed[0], truth[0, 0]])))
-        statics = [(COLOR_FRAME, se3.inverse(sequence.T_color_depth))]
+    streams = image_streams(sequence)
+    truth = ground_truth(sequence.spline, *(stream.stamps for stream in streams.values()))
+    losses, body, of_body = {}, BODY_FRAME, "T_world_body of tf and pose, T_body_cam of tf_static"
+    if isinstance(sequence, Sequence):
+        losses, body = {_LOSS: loss_of_tf(sequence, truth)}, DEPTH_FRAME
+        of_body = "T_world_depth of tf and pose, T_depth_color of tf_static"
+    facts = shutter_facts(sequence, losses) | {"poses": of_body}
+    firsts = [float(stream.listed[0]) for stream in streams.values()]
+    with new_bag(out, options, min(firsts)) as bag:
+        start = max(0, min(nanoseconds([*firsts, truth[0, 0]])))
+        moved = [s for s in sequence.streams.values() if not (isinstance(sequence, Sequence) and s.is_depth)]
+        statics = {_frame(sequence, stream): se3.inverse(stream.T_cam_body) for stream in moved}
         if imu:
-            statics.append((IMU_FRAME, imu.config.T_depth_imu()))
-        _write_latched(bag, start, statics, facts, sequence.spline)
-        sources = [_poses(bag, truth), *(_images(bag, sequence, stream) for stream in (color[0], depth[0]))]
+            statics[IMU_FRAME] = imu.config.T_depth_imu()
+        _write_latched(bag, start, body, statics, facts, sequence.spline)
+        sources = [_poses(bag, truth, body), *(_images(bag, sequence, stream) for stream in streams.values())]
         if imu:
             sources.append(_imu(bag, imu))
-        images, written = len(color[0].paths) + len(depth[0].paths), 0
+        images, written = sum(len(stream.paths) for stream in streams.values()), 0
         for _, write in heapq.merge(*sources, key=lambda message: message[0]):
             write()
             if (count := bag.images) > written:
                 written = count
                 progress("export", written / images, f"image {written} of {images}")
-    parts = f"{len(color[0].paths)} colour and {len(depth[0].paths)} depth images, {'IMU' if imu else 'no IMU'}"
+    parts = f"{counted(streams)}, {'IMU' if imu else 'no IMU'}"
     return f"{out}: {parts}, {int((truth[:, 0] >= 0).sum())} poses; {loss_words(losses)}"
 
 
@@ -100,21 +106,21 @@ def spline_facts(spline: Spline) -> dict[str, Any]:
 
 
 def _write_latched(
-    bag: Bag, ns: int, statics: list[tuple[str, FloatArray]], facts: dict[str, Any], spline: Spline
+    bag: Bag, ns: int, body: str, statics: dict[str, FloatArray], facts: dict[str, Any], spline: Spline
 ) -> None:
-    transforms = [_transform(bag, ns, DEPTH_FRAME, child, pose) for child, pose in statics]
+    transforms = [_transform(bag, ns, body, child, pose) for child, pose in statics.items()]
     bag.add("/tf_static", TF, latched=True)(ns, transforms=transforms)
     for topic, data in ((SHUTTER_TOPIC, facts), (SPLINE_TOPIC, spline_facts(spline))):
         bag.add(topic, "std_msgs/msg/String", latched=True)(ns, data=json.dumps(data))
 
 
-def _poses(bag: Bag, truth: FloatArray) -> Iterator[Message]:
+def _poses(bag: Bag, truth: FloatArray, body: str) -> Iterator[Message]:
     """tf and poses from time 0 on."""
     tf, posed = bag.add("/tf", TF), bag.add(POSE_TOPIC, "geometry_msgs/msg/PoseStamped")
     truth = truth[truth[:, 0] >= 0]
 
     def write(ns: int, row: FloatArray) -> None:
-        tf(ns, transforms=[_transform(bag, ns, WORLD_FRAME, DEPTH_FRAME, row)])
+        tf(ns, transforms=[_transform(bag, ns, WORLD_FRAME, body, row)])
         position, orientation = bag.vector("Point", row[:3]), bag.vector("Quaternion", row[3:])
         pose = bag.message("geometry_msgs/msg/Pose", position=position, orientation=orientation)
         posed(ns, header=bag.header(ns, WORLD_FRAME), pose=pose)
@@ -133,15 +139,27 @@ def _transform(bag: Bag, ns: int, parent: str, child: str, pose: FloatArray) -> 
     )
 
 
-def _images(bag: Bag, sequence: Sequence, stream: ImageStream) -> Iterator[Message]:
-    topic = COLOR_TOPIC if stream.name == "color" else ALIGNED_TOPIC if stream.registered else DEPTH_TOPIC
-    frame = DEPTH_FRAME if topic == DEPTH_TOPIC else COLOR_FRAME
+def _frame(sequence: Rig, stream: ImageStream) -> str:
+    """The frame of a stream's images."""
+    if isinstance(sequence, Sequence):
+        return DEPTH_FRAME if stream.is_depth and not stream.registered else COLOR_FRAME
+    return f"{stream.name}_optical_frame"
+
+
+def _topic(sequence: Rig, stream: ImageStream) -> str:
+    if isinstance(sequence, Sequence):
+        return COLOR_TOPIC if stream.name == "color" else ALIGNED_TOPIC if stream.registered else DEPTH_TOPIC
+    return f"/camera/{stream.name}/image_{'rect_raw' if stream.is_depth else 'raw'}"
+
+
+def _images(bag: Bag, sequence: Rig, stream: ImageStream) -> Iterator[Message]:
+    topic, frame = _topic(sequence, stream), _frame(sequence, stream)
     image = bag.add(topic, "sensor_msgs/msg/Image")
     info = bag.add(f"{topic.rpartition('/')[0]}/camera_info", "sensor_msgs/msg/CameraInfo")
 
     def write(ns: int, k: int) -> None:
         header = bag.header(ns, frame)
-        pixels, encoding = (sequence.color(k), "rgb8") if stream.name == "color" else _depth(sequence, k)
+        pixels, encoding = _depth(sequence, stream, k) if stream.is_depth else _picture(sequence, stream, k)
         size = {"height": pixels.shape[0], "width": pixels.shape[1]}
         data = np.ascontiguousarray(pixels).view(np.uint8).reshape(-1)
         step = data.size // pixels.shape[0]
@@ -153,9 +171,14 @@ def _images(bag: Bag, sequence: Sequence, stream: ImageStream) -> Iterator[Messa
         yield ns, partial(write, ns, k)
 
 
-def _depth(sequence: Sequence, k: int) -> tuple[np.ndarray, str]:
+def _picture(sequence: Rig, stream: ImageStream, k: int) -> tuple[np.ndarray, str]:
+    pixels = sequence.picture(stream.name, k)
+    return pixels, "rgb8" if pixels.ndim == 3 else "mono8"
+
+
+def _depth(sequence: Rig, stream: ImageStream, k: int) -> tuple[np.ndarray, str]:
     """Depth image k as ROS has it (REP 118), lossless: mm where the file has them, else metres."""
-    units, scale = sequence.depth_units(k), sequence.streams["depth"].depth_scale
+    units, scale = sequence.units(stream.name, k), stream.depth_scale
     if scale == 1000.0:
         return units.astype("<u2"), "16UC1"
     return np.where(units > 0, units / scale, np.nan).astype("<f4"), "32FC1"

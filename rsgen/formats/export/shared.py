@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_bytes, write_error
@@ -19,7 +19,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
-from rsgen.sequence.images import ImageStream, Sequence
+from rsgen.sequence.images import ImageStream, Rig, Sequence
 
 Storage = Literal["sqlite3", "mcap"]
 EPOCH_S = 1_000_000_000
@@ -108,15 +108,25 @@ def _linked(source: Path, target: Path) -> bool:
     return True
 
 
-def image_streams(sequence: Sequence) -> tuple[tuple[ImageStream, FloatArray], tuple[ImageStream, FloatArray]]:
-    """Colour and depth streams, each with the camera of its images and its T_cam_depth (4, 4).
+def image_streams(sequence: Rig) -> dict[str, ImageStream]:
+    """All streams by name, each with the camera of its images and that camera's T_cam_body.
 
     Registered depth has the colour camera and keeps the sensor's shutter, row for row.
     """
-    color, depth = sequence.streams["color"], sequence.streams["depth"]
-    return (color, sequence.T_color_depth), (
-        replace(depth, camera=sequence.depth_image_camera), sequence.T_image_depth,
-    )  # fmt: skip
+    streams = dict(sequence.streams)
+    if isinstance(sequence, Sequence):
+        camera, T = sequence.depth_image_camera, sequence.T_image_depth
+        streams["depth"] = replace(streams["depth"], camera=camera, T_cam_body=T)
+    return streams
+
+
+def counted(streams: Mapping[str, ImageStream]) -> str:
+    """How many images there are, in words."""
+    words = {"color": "colour"}
+    kinds = list(dict.fromkeys(stream.kind for stream in streams.values()))
+    counts = (sum(len(s.paths) for s in streams.values() if s.kind == kind) for kind in kinds)
+    parts = [f"{count} {words.get(kind, kind)}" for count, kind in zip(counts, kinds, strict=True)]
+    return f"{', '.join(parts[:-1])}{' and ' if len(parts) > 1 else ''}{parts[-1]} images"
 
 
 def four_coefficients(name: str, camera: Camera) -> list[float]:

@@ -31,9 +31,12 @@ def matches(root: Path) -> bool:
     return (root / "sequence.yaml").exists()
 
 
-def read(root: Path, camera_file: Path | None) -> Dataset:
-    """A sequence, with the cameras that took it or with those of a camera file. Raises UserError."""
-    sequence = read_sequence(root)
+def read(root: Path, camera_file: Path | None, color: str | None = None, depth: str | None = None) -> Dataset:
+    """A sequence, with the cameras that took it or with those of a camera file. Raises UserError.
+
+    color, depth: of a rig, the two cameras by name; by default the first of either kind.
+    """
+    sequence = read_sequence(root, color, depth)
     if _is_exact(sequence):
         found = _exact(root, sequence)
     else:

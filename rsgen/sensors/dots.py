@@ -11,19 +11,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rsgen.array_types import Float32Array, FloatArray
+from rsgen.array_types import Float32Array
 from rsgen.config.rig import DotsConfig
 from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
+from rsgen.sensors.stereo import dot_pattern
 
 # Rays from a surface to the projector end this much short of either, as a fraction of their length.
 _SHORT = 1e-4
 _SIDE = 3  # rays of a pixel, squared: a dot is about as wide as one
-_TEXELS = 4  # of the pattern across a dot
-_PATTERN = 0x646F7473  # "dots"
 
 
 class DotProjector:
@@ -78,27 +77,3 @@ class DotProjector:
         light = dr.block_sum(dr.select(valid, brightness, 0), _SIDE**2)
         shape = camera.height, camera.width
         return np.asarray(light, np.float32).reshape(shape) * np.float32(self._config.power / _SIDE**2)
-
-
-def dot_pattern(config: DotsConfig, half: FloatArray, seed: int) -> Float32Array:
-    """The pattern (rows, columns) on the plane at 1 m, from -half to half (2,) in x and y, m; 1 in a dot's middle.
-
-    One dot at a random place in each of `count` cells of a grid, so that none of the field is bare.
-    """
-    width = np.deg2rad(config.dot_deg)
-    columns, rows = (max(8, int(np.ceil(2 * h * _TEXELS / width))) for h in half)
-    across = max(1, round(np.sqrt(config.count * columns / rows)))
-    down = max(1, round(config.count / across))
-    place = np.random.default_rng([_PATTERN, seed]).random((down, across, 2))
-    x = ((np.arange(across) + place[..., 0]) / across * columns).ravel()
-    y = ((np.arange(down)[:, None] + place[..., 1]) / down * rows).ravel()
-    sigma = _TEXELS / np.sqrt(8 * np.log(2))
-    reach = np.arange(-2 * _TEXELS, 2 * _TEXELS + 1)
-    column, row = np.floor(x)[:, None, None] + reach, np.floor(y)[:, None, None] + reach[:, None]
-    squared = (column + 0.5 - x[:, None, None]) ** 2 + (row + 0.5 - y[:, None, None]) ** 2
-    column, row = np.broadcast_arrays(column, row)
-    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    pattern = np.zeros((rows, columns), np.float32)
-    places = row[inside].astype(np.int64), column[inside].astype(np.int64)
-    np.maximum.at(pattern, places, np.exp(-squared[inside] / (2 * sigma**2)).astype(np.float32))
-    return pattern
