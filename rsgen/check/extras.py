@@ -91,6 +91,19 @@ def check_target(sequence: Rig) -> tuple[bool, str]:
     return True, f"{target.grid.tag_count} tags, corners as config.target has them"
 
 
+def check_labels(sequence: Rig) -> tuple[bool, str]:
+    """Every frame has labels of the table, and there is one wherever there is depth. Raises UserError."""
+    seen = np.zeros(len(sequence.label_table) + 1, np.int64)
+    for name, stream in sequence.streams.items():
+        for k in range(len(stream.paths)):
+            labels = sequence.labels(name, k)
+            seen += np.bincount(labels.ravel(), minlength=len(seen))
+            if stream.is_depth and ((labels > 0) != (sequence.exact_depth(name, k) > 0)).any():
+                return False, f"{sequence.root / stream.files.labels / stream.paths[k].name}: is not of that frame"
+    classes = {label.class_name for label in sequence.label_table}
+    return True, f"{len(seen) - 1} things of {len(classes)} classes, {int((seen[1:] > 0).sum())} of them seen"
+
+
 def check_objects(sequence: Rig) -> tuple[bool, str]:
     """Poses of all objects are what their splines give, and every exact image has a mask that decodes.
 
@@ -122,6 +135,8 @@ def extra_checks(sequence: Rig) -> list[tuple[str, Callable[[], tuple[bool, str]
         checks.append(("true cameras", partial(check_true_cameras, sequence, config)))
     if isinstance(config, dict) and config.get("target") is not None:
         checks.append(("target", partial(check_target, sequence)))
+    if sequence.label_table:
+        checks.append(("labels", partial(check_labels, sequence)))
     if sequence.objects:
         checks.append(("objects", partial(check_objects, sequence)))
     if any(stream.truth_images for stream in sequence.streams.values()):

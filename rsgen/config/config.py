@@ -176,6 +176,7 @@ class Config(Section):
         for section, name in _PATHS:
             if content[section][name] is not None:
                 content[section][name] = Path(content[section][name]).name
+        content["truth"] = self.truth.content()
         if self.imu is not None:
             content["imu"] = self.imu.content()
         if self.objects:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -169,6 +169,19 @@ class TruthConfig(Section):
     color_depth: bool = Field(
         default=False, description="planar z seen by the colour camera itself, m; truth/color_depth, EXR"
     )
+
+    labels: bool = Field(
+        default=False,
+        description="which thing each pixel of colour and depth shows; 16-bit PNG, truth/labels, truth/depth_labels; "
+        "table truth/labels.yaml, boxes truth/boxes_*.csv",
+    )
+    classes: dict[str, tuple[str, ...]] = Field(
+        default={}, description="of labels: patterns of names by class; others: the name without its number"
+    )
+
+    def content(self) -> dict[str, Any]:
+        """As sequence.yaml records it: labels only where there are some, as before there were any."""
+        return self.model_dump(mode="json", exclude=set() if self.labels else {"labels", "classes"})
 
     @model_validator(mode="after")
     def _flow_has_a_target(self) -> TruthConfig:

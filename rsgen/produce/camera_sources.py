@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
+from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray, UInt16Array
 from rsgen.config.cameras import ColorConfig, DepthConfig
 from rsgen.config.rig import RigColorConfig, RigDepthConfig
 from rsgen.config.sections import TruthConfig
@@ -51,7 +51,8 @@ class DepthShot:
     """Depth frame `frame`: exact planar z (h, w) in m, and the pixels that the projector does not light, if asked.
 
     blurred: z as the line's whole exposure gives it; None where its middle stands for it. ids (h, w): numbers of the
-    objects seen, 0 for none; None where nothing moves. pair: the two grey images (h, w) that depth is computed from.
+    objects seen, 0 for none; None where nothing moves. labels (h, w): of all things, if asked for. pair: the two grey
+    images (h, w) that depth is computed from.
     """
 
     frame: int
@@ -59,6 +60,7 @@ class DepthShot:
     shadow: BoolArray | None
     blurred: Float32Array | None = None
     ids: Float32Array | None = None
+    labels: UInt16Array | None = None
     pair: tuple[ByteArray, ByteArray] | None = None
 
 
@@ -67,6 +69,7 @@ class Stage:
     """What cameras look at: a scene, an integrator, as `load_scene` and `make_integrator` return them, and objects.
 
     objects: that move, of the integrator; None without. seed: of all that is chance. is_global: all lines at once.
+    instances: of the scene, where labels are asked for.
     """
 
     scene: Any
@@ -74,6 +77,7 @@ class Stage:
     objects: Any
     seed: int
     is_global: bool = False
+    instances: Any = None
 
     def shutter(self, shutter: Shutter) -> Shutter:
         """The shutter that a stream's stands for here."""
@@ -93,8 +97,9 @@ class ColorSource:
         self.T_body_cam = se3.inverse(T_cam_body)
         shutter = stage.shutter(config.shutter)
         self._color = render.ColorRenderer(stage.scene, stage.integrator, config.camera, shutter, config.spp)
-        wanted = bool(truth.images) or stage.objects is not None
-        self._truth = TruthRenderer(stage.scene, stage.integrator, config, truth, stage.objects) if wanted else None
+        wanted = bool(truth.images) or truth.labels or stage.objects is not None
+        seen = stage.objects, stage.instances
+        self._truth = TruthRenderer(stage.scene, stage.integrator, config, truth, *seen) if wanted else None
         self._dots = None
         if isinstance(config, RigColorConfig) and config.dots is not None:
             from rsgen.sensors.dots import DotProjector
@@ -194,7 +199,7 @@ class DepthSource:
         self._stage, self._name, self.config, self._registered_to = stage, name, config, registered_to
         self._T_body_cam = None if (T_cam_body == np.eye(4)).all() else se3.inverse(T_cam_body)
         shutter = stage.shutter(config.shutter)
-        self._depth = render.DepthRenderer(stage.scene, config.camera, shutter, stage.objects)
+        self._depth = render.DepthRenderer(stage.scene, config.camera, shutter, stage.objects, stage.instances)
         instant = replace(shutter, exposure_s=0.0)
         self._instant = render.DepthRenderer(stage.scene, config.camera, instant, stage.objects)
         self._rays = config.camera.unproject(config.camera.pixel_grid()) if registered_to else np.empty(0)
@@ -207,17 +212,17 @@ class DepthSource:
     def expose(self, spline: Spline, stamp: float, frame: int) -> DepthShot:
         """Cast the frame at `stamp` (s), and render the images that it is computed from, if it is."""
         pose = self._pose(spline)
-        z, ids = self._depth.cast(pose, stamp)
+        z, ids, labels = self._depth.cast(pose, stamp)
         # The projector takes the depth sensor as it is now: exposed to this frame.
         shadow = None if self._projector is None else ~self._projector.lights(z, pose, stamp)
         pair = tuple(source.picture(spline, stamp, frame)[..., 0] for source in self._pair)
         config = self.config
         if config.blur_samples == 1 or pair:
-            return DepthShot(frame, z, shadow, ids=ids, pair=pair or None)  # type: ignore[arg-type]
+            return DepthShot(frame, z, shadow, ids=ids, labels=labels, pair=pair or None)  # type: ignore[arg-type]
         share = (np.arange(config.blur_samples) + 0.5) / config.blur_samples
         instants = stamp - config.exposure_s * (1 - share)
         samples = [self._instant.render(pose, float(t)) for t in instants]
-        return DepthShot(frame, z, shadow, mixed_depth(samples, config.noise.model == "tof"), ids)
+        return DepthShot(frame, z, shadow, mixed_depth(samples, config.noise.model == "tof"), ids, labels)
 
     def develop(self, shot: DepthShot) -> Float32Array:
         """Planar z (h, w) in m that the camera reports, 0 where nothing; of colour's size where registered."""

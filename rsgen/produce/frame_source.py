@@ -76,4 +76,4 @@ def _write_color(writer: SequenceWriter, source: ColorSource, stream: str, k: in
 
 
 def _write_depth(writer: SequenceWriter, source: DepthSource, stream: str, k: int, shot: DepthShot) -> None:
-    writer.write_depth(k, shot.z, source.develop(shot), shot.ids, stream=stream)
+    writer.write_depth(k, shot.z, source.develop(shot), shot.ids, stream=stream, labels=shot.labels)

@@ -25,10 +25,12 @@ from rsgen.produce.parts import (
     load_motion,
     load_scene,
     open_frames,
+    scene_instances,
     sequence_stamps,
 )
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Reading, Setting, adapt
+from rsgen.sequence.labels import LABELS, labels_yaml, thing_of
 from rsgen.sequence.truth_files import mesh_file
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
@@ -65,6 +67,9 @@ def render_sequence(
     if not (out / "scene.ply").is_file():
         scene = scene or load_scene(config)
         write_scene_ply(scene, out / "scene.ply")
+    if config.truth.labels and not (out / LABELS).is_file():
+        scene = scene or load_scene(config)
+        atomic_write(out / LABELS, encode_yaml(label_table(scene, config, meshes)))
     for thing, mesh in zip(config.objects, meshes, strict=True):
         write_ply(mesh.vertices, mesh.faces, out / mesh_file(thing.name))
     try:
@@ -105,6 +110,18 @@ def _check_ways(config: Config, motion: TrueMotion, meshes: Sequence[Any], scene
     least = config.trajectory.clearance_m if config.motion is None else config.motion.clearance_m
     if least is not None:
         check_clearance(motion.spline, scene_triangles(scene), least)
+
+
+def label_table(scene: Any, config: Config, meshes: Sequence[Any]) -> dict[str, Any]:
+    """What labels stand for: things of the scene, then the objects that move. Raises UserError."""
+    instances, corners = scene_instances(scene, config), scene_triangles(scene)
+    order = np.argsort(instances.of_triangle, kind="stable")
+    ends = np.cumsum(np.bincount(instances.of_triangle, minlength=len(instances.names) + 1)[1:])
+    of_thing = np.split(corners[order], ends[:-1])
+    things = [thing_of(name, part) for name, part in zip(instances.names, of_thing, strict=True)]
+    for thing, mesh in zip(config.objects, meshes, strict=True):
+        things.append(thing_of(thing.name, mesh.vertices[mesh.faces]))
+    return labels_yaml(things, config.truth.classes)
 
 
 def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:

@@ -217,7 +217,15 @@ def open_frames(
     scene = scene or load_scene(config)
     integrator = make_integrator(mi, scene, config, progress, objects)
     things = integrator.objects if objects else None
-    return FrameSource(Stage(scene, integrator, things, config.seed, global_shutter), config)
+    instances = scene_instances(scene, config) if config.truth.labels else None
+    return FrameSource(Stage(scene, integrator, things, config.seed, global_shutter, instances), config)
+
+
+def scene_instances(scene: Any, config: Config) -> Any:
+    """`rsgen.render.labels.Instances` of the config's loaded scene. Raises UserError."""
+    from rsgen.render.labels import find_instances
+
+    return find_instances(scene, config.scene.file, _options(config.scene))
 
 
 def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()) -> Any:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import ByteArray, Float32Array, FloatArray
+from rsgen.array_types import ByteArray, Float32Array, FloatArray, UInt16Array
 from rsgen.config.cameras import DepthConfig
 from rsgen.config.config import Config
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error
 from rsgen.geometry.spline import Spline
-from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png
+from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png, read_png
 from rsgen.produce.records import (
     ListedStream,
     describe,
@@ -33,6 +33,7 @@ from rsgen.sensors.imu import sample_clock
 from rsgen.sensors.reports import color_clock
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
 from rsgen.sequence.format import (
+    LABELS_IMAGE,
     OBJECT_CHANNELS,
     OBJECTS,
     frame_name,
@@ -40,6 +41,7 @@ from rsgen.sequence.format import (
     line_poses,
     pose_lines,
 )
+from rsgen.sequence.labels import boxes_text
 from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, spline_file, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
@@ -95,6 +97,7 @@ class SequenceWriter:
             if not (out / "sequence.yaml").exists():
                 atomic_write(out / "sequence.yaml", encode_yaml(text))
             folders = {folder for stream in streams.values() for folder in _folders(stream, bool(objects))}
+            folders |= {stream.files.labels for stream in streams.values() if config.truth.labels}
             for folder in (*folders, *([OBJECTS] if objects else [])):
                 (out / folder).mkdir(parents=True, exist_ok=True)
             for folder in ("", "truth", *folders):
@@ -145,15 +148,17 @@ class SequenceWriter:
         self, k: int, rgb: ByteArray, truth: Mapping[str, npt.NDArray[Any]] = MappingProxyType({}),
         stream: str = "color",
     ) -> None:  # fmt: skip
-        """Write frame k of a colour or grey camera, sRGB (h, w, 3) uint8, and its images of `image_truth`.
+        """Write frame k of a colour or grey camera, sRGB (h, w, 3) uint8, its images of `image_truth`, and labels.
 
-        These are uint8 (h, w, 3), or float32 (h, w) or (h, w, n) with n EXR channels. Of a grey camera the first of the
-        three channels is kept. Raises UserError if the disk refuses one.
+        These are uint16 (h, w), the others uint8 (h, w, 3), or float32 (h, w) or (h, w, n) with n EXR channels. Of a
+        grey camera the first of the three channels is kept. Raises UserError if the disk refuses one.
         """
         listed = self.streams[stream]
         shape = listed.config.camera.height, listed.config.camera.width
-        if truth.keys() != listed.truth.keys():
-            raise ValueError(f"truth of a colour frame is {sorted(listed.truth)}, not {sorted(truth)}")
+        wanted = listed.truth.keys() | ({LABELS_IMAGE} if self.config.truth.labels else set())
+        if truth.keys() != wanted:
+            raise ValueError(f"truth of a colour frame is {sorted(wanted)}, not {sorted(truth)}")
+        self._write_labels(stream, k, truth.get(LABELS_IMAGE))
         for name, channels in listed.truth.items():
             image = truth[name]
             planes = () if len(channels) == 1 else (len(channels) or 3,)
@@ -165,14 +170,15 @@ class SequenceWriter:
 
     def write_depth(
         self, k: int, z: Float32Array, reported: Float32Array | None = None, ids: Float32Array | None = None,
-        stream: str = "depth",
+        stream: str = "depth", labels: UInt16Array | None = None,
     ) -> None:  # fmt: skip
         """Write depth frame k, planar z (h, w) float32 in metres; 0, negative, inf and NaN mean nothing measured.
 
         The exact image gets z; the depth image what the camera reports (default: z; of the colour camera's size where
         depth is registered), rounded to 1/depth_scale m, 0 where that leaves 16 bits. ids (h, w): of the objects seen,
-        where there are any. Raises UserError if the disk refuses it.
+        where there are any; labels (h, w): where they are asked for. Raises UserError if the disk refuses it.
         """
+        self._write_labels(stream, k, labels)
         if (ids is None) != (not self.objects):
             raise ValueError("ids of a depth frame are of a sequence with objects, and only there")
         listed = self.streams[stream]
@@ -208,6 +214,12 @@ class SequenceWriter:
             if stream.writes_table:
                 table = stream.table.of(np.flatnonzero(stream.is_delivered))
                 atomic_write(out / stream.files.frame_table, table.text().encode())
+        if config.truth.labels:
+            for name, stream in self.streams.items():
+                camera = stream.config.camera
+                shape = camera.height, camera.width
+                frames = ((k, read_png(self._labels_path(name, k), shape, np.uint16)) for k in written[name])
+                atomic_write(out / stream.files.boxes, boxes_text(frames).encode())
         last = list(self.streams.values())[-1]  # of two cameras depth
         delivered = last.table.listed_s[last.is_delivered]
         middle = float(delivered[len(delivered) // 2])
@@ -221,6 +233,17 @@ class SequenceWriter:
             atomic_write(out / TARGET_CORNERS, text.encode())
         if config.imu is not None:
             write_imu(out, spline, config.imu, faults.imu, config.seed, middle, T_image_depth)
+
+    def _write_labels(self, stream: str, k: int, labels: UInt16Array | None) -> None:
+        if (labels is None) == self.config.truth.labels:
+            raise ValueError("labels of a frame are of a sequence with truth.labels, and only there")
+        if labels is not None:
+            camera = self.streams[stream].config.camera
+            _expect(labels, (camera.height, camera.width), np.uint16)
+            atomic_write(self._labels_path(stream, k), encode_png(labels))
+
+    def _labels_path(self, stream: str, k: int) -> Path:
+        return self.out / self.streams[stream].files.labels / f"{frame_name(k)}.png"
 
     def _path(self, stream: str, k: int) -> Path:
         if not 0 <= k < len(self.stamps(stream)):
@@ -241,6 +264,7 @@ class SequenceWriter:
         else:
             files = (listed.files.truth_image(name, channels, frame_name(k)) for name, channels in listed.truth.items())
             truth = [self.out / file for file in files]
+        truth += [self._labels_path(stream, k)] if self.config.truth.labels else []
         paths = [self._path(stream, k), *truth]
         return all(path.is_file() and path.stat().st_size > 0 for path in paths)
 

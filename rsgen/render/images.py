@@ -6,17 +6,18 @@ Pixels are summed in a fixed order (no atomics), so the same frame is the same t
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rsgen.array_types import Float32Array
+from rsgen.array_types import Float32Array, UInt16Array
 from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
+from rsgen.render.labels import Instances
 from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
 
@@ -114,24 +115,36 @@ class ColorRenderer:
         return self.sensor.sample_ray_differential(time, mi.Float(0), position, mi.Point2f(0.5))[0]
 
 
+class DepthCast(NamedTuple):
+    """z (h, w): planar, m, 0 where a ray hits nothing. ids (h, w): which moving object, 0 none; None: nothing moves.
+
+    labels (h, w): number of the thing, of moving objects after those of the scene; None where not asked for.
+    """
+
+    z: Float32Array
+    ids: Float32Array | None
+    labels: UInt16Array | None
+
+
 class DepthRenderer:
     """Planar depth frames: one ray through each pixel's centre at its line's mid-exposure."""
 
-    def __init__(self, scene: Any, camera: Camera, shutter: Shutter, objects: MovingObjects | None = None) -> None:
-        self._scene = scene
+    def __init__(
+        self, scene: Any, camera: Camera, shutter: Shutter, objects: MovingObjects | None = None,
+        instances: Instances | None = None,
+    ) -> None:  # fmt: skip
+        """instances: of the scene, where labels are asked for."""
+        self._scene, self._instances = scene, instances
         self.sensor = RollingShutterSensor(camera, shutter)
         self._exposure = shutter.exposure_s
         self._objects = objects
 
     def render(self, T_world_cam: PoseFunction, stamp: float) -> Float32Array:
         """Planar z (h, w) float32, metres, of the frame at `stamp` (s); 0 where the ray hits nothing."""
-        return self.cast(T_world_cam, stamp)[0]
+        return self.cast(T_world_cam, stamp).z
 
-    def cast(self, T_world_cam: PoseFunction, stamp: float) -> tuple[Float32Array, Float32Array | None]:
-        """`render`'s z, and which of the moving objects each pixel shows (h, w): 0 none, k + 1 the k-th.
-
-        None where nothing moves.
-        """
+    def cast(self, T_world_cam: PoseFunction, stamp: float) -> DepthCast:
+        """What the pixels' rays meet in the frame at `stamp` (s)."""
         self.sensor.expose(T_world_cam, stamp)
         camera = self.sensor.camera
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
@@ -140,14 +153,22 @@ class DepthRenderer:
         ray, _ = self.sensor.sample_ray(0.5 * self._exposure, mi.Float(0), position, mi.Point2f(0.5))
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
         shape = camera.height, camera.width
+        label = mi.UInt32(0) if self._instances is None else self._instances.seen_by(hit)
         if self._objects is None:
             z = dr.select(hit.is_valid(), hit.t * self.sensor.planar_depth_scale(u, v), 0)
-            return np.array(z, np.float32).reshape(shape), None
+            dr.eval(z, label)
+            return DepthCast(np.array(z, np.float32).reshape(shape), None, self._labels(label, shape))
         objects = self._objects.expose(camera, self.sensor.shutter, stamp)
         meeting = objects.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
         z = dr.select(dr.isfinite(meeting.t), meeting.t * self.sensor.planar_depth_scale(u, v), 0)
-        dr.eval(z, meeting.number)
-        return np.array(z, np.float32).reshape(shape), np.array(meeting.number, np.float32).reshape(shape)
+        if self._instances is not None:
+            label = dr.select(meeting.number > 0, len(self._instances.names) + meeting.number, label)
+        dr.eval(z, meeting.number, label)
+        ids = np.array(meeting.number, np.float32).reshape(shape)
+        return DepthCast(np.array(z, np.float32).reshape(shape), ids, self._labels(label, shape))
+
+    def _labels(self, label: Any, shape: tuple[int, int]) -> UInt16Array | None:
+        return None if self._instances is None else np.array(label).astype(np.uint16).reshape(shape)
 
 
 def global_shutter(shutter: Shutter) -> Shutter:

@@ -31,6 +31,7 @@ STREAMS = ("color", "depth")  # of format 1
 OBJECTS = "truth/objects"  # splines, poses and meshes of things that move by themselves
 OBJECT_IDS = "object_ids"  # exact image: which of them each pixel of a colour frame shows, 0 for none
 OBJECT_CHANNELS = ("id",)
+LABELS_IMAGE = "labels"  # of a frame's truth as it is rendered: 16 bit, in a folder of its own
 CLEAN_COLOR = "color"  # exact image: what a colour camera without noise would have reported
 GROUND_TRUTH_HZ = 200.0
 DEPTH_SCALE = 5000.0  # units per metre of depth images, unless stated otherwise: as TUM's and ICL-NUIM's

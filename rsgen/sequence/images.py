@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray
+from rsgen.array_types import ByteArray, Float32Array, FloatArray, IntArray, UInt16Array
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -19,6 +19,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import read_exr, read_npy, read_png
 from rsgen.sequence.camera_yaml import read_true_cameras
 from rsgen.sequence.format import IMAGE_KINDS, OBJECT_CHANNELS, StreamKind, poses_of_rows
+from rsgen.sequence.labels import LABELS, Label, read_labels
 from rsgen.sequence.stream_files import StreamFiles
 from rsgen.sequence.truth_files import FrameTable, SequenceObject
 
@@ -140,6 +141,22 @@ class Rig:
         if not np.isin(ids, np.arange(len(self.objects) + 1)).all():
             raise UserError(f"{path}: names objects that there are not: render it again")
         return ids.astype(np.uint8)
+
+    @cached_property
+    def label_table(self) -> tuple[Label, ...]:
+        """What labels stand for, in the order of their ids; empty where there are none."""
+        return read_labels(self.root / LABELS) if (self.root / LABELS).is_file() else ()
+
+    def labels(self, stream: str, k: int) -> UInt16Array:
+        """Number of the thing that each pixel (h, w) of exact image k shows, 0 none; see `label_table`."""
+        s = self.streams[stream]
+        path = self.root / s.files.labels / s.paths[k].name
+        if not self.label_table:
+            raise UserError(f"{self.root}: has no labels: render with truth.labels set")
+        labels: UInt16Array = read_png(path, (s.camera.height, s.camera.width), np.uint16)
+        if labels.max(initial=0) > len(self.label_table):
+            raise UserError(f"{path}: names things that there are not: render it again")
+        return labels
 
     def rows(self, stream: str) -> FloatArray:
         """Poses (n, lines, 7) tx ty tz qx qy qz qw of each line's camera in the world at mid-exposure.

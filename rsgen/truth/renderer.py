@@ -17,6 +17,8 @@ normals: of the triangle at p, in the camera frame of the line's mid-exposure, t
 color_depth: planar z of p, m; 0 at infinity.
 
 object_ids: which of the moving objects p is on, 0 for none; p then moves with it, in all of the above.
+
+labels: which thing of the scene p is on, moving objects counted after those that rest.
 """
 
 from __future__ import annotations
@@ -38,10 +40,11 @@ from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
+from rsgen.render.labels import Instances
 from rsgen.render.moving_objects import MovingObjects, ObjectsInFrame
 from rsgen.render.sensor import RollingShutterSensor
 from rsgen.sensors.color import to_srgb8
-from rsgen.sequence.format import OBJECT_IDS
+from rsgen.sequence.format import LABELS_IMAGE, OBJECT_IDS
 
 # Rays that ask whether a point is seen end this much short of it, as a fraction of their length: 0.1 mm at 1 m.
 _SHORT = 1e-4
@@ -52,13 +55,14 @@ class TruthRenderer:
     """Renders what a `TruthConfig` asks for. Holds its sensors between frames, so that kernels are compiled once."""
 
     def __init__(
-        self, scene: Any, integrator: Any, color: ColorConfig, truth: TruthConfig, objects: MovingObjects | None = None
-    ) -> None:
+        self, scene: Any, integrator: Any, color: ColorConfig, truth: TruthConfig, objects: MovingObjects | None = None,
+        instances: Instances | None = None,
+    ) -> None:  # fmt: skip
         """`scene` and `integrator` as for `ColorRenderer`; `color` is the stream that the images belong to.
 
-        objects: moving objects, whose masks then are made too.
+        objects: moving objects, whose masks then are made too. instances: of the scene, for labels.
         """
-        self._scene, self._truth = scene, truth
+        self._scene, self._truth, self._instances = scene, truth, instances
         self._camera, self._shutter = color.camera, color.shutter
         self._gain = color.exposure_gain
         sharp = Shutter(self._shutter.readout_s, 0.0, self._shutter.scan)
@@ -73,11 +77,12 @@ class TruthRenderer:
     ) -> dict[str, NDArray[Any]]:  # fmt: skip
         """Every image of `TruthConfig.images` of the frame at `stamp` (s): uint8 sRGB (h, w, 3), or float32 (h, w, n).
 
-        With `object_ids` if there are moving objects. n is the number of the image's EXR channels; with one channel the
-        image is (h, w). `T_world_cam` takes times (n,) s to poses (n, 4, 4) of the colour camera; UserError if it ends
-        before a frame's last line. `next_stamp` is the next frame's stamp, None after the last frame: then flow_next is
-        0 and nowhere valid. `seed` decides the random numbers of the frame's twins. exposure_s: of this frame and the
-        next, where they are others than the stream's. brightness: factor on the light of the 8-bit images.
+        With `object_ids` if there are moving objects, and `labels`, uint16 (h, w), where instances are known. n is the
+        number of the image's EXR channels; with one channel the image is (h, w). `T_world_cam` takes times (n,) s to
+        poses (n, 4, 4) of the colour camera; UserError if it ends before a frame's last line. `next_stamp` is the next
+        frame's stamp, None after the last frame: then flow_next is 0 and nowhere valid. `seed` decides the random
+        numbers of the frame's twins. exposure_s: of this frame and the next, where they are others than the stream's.
+        brightness: factor on the light of the 8-bit images.
         """
         if exposure_s is not None:
             shutters = [replace(self._shutter, exposure_s=each) for each in exposure_s]
@@ -92,19 +97,22 @@ class TruthRenderer:
             instant = global_instant(self._camera, shutter, stamp, time)
             linear = self._global.render(T_world_cam, instant, _seed(seed, 1 + _TIMES.index(time)))
             images[f"global_{time}"] = to_srgb8(linear, gain)
-        if truth.flow or truth.normals or truth.blur_length or truth.color_depth or self._things:
+        if truth.flow or truth.normals or truth.blur_length or truth.color_depth or self._things or self._instances:
             images |= self._geometry(T_world_cam, stamp, next_stamp, *shutters)
-        return {name: images[name] for name in (*truth.images, *((OBJECT_IDS,) if self._things else ()))}
+        others = [*([OBJECT_IDS] if self._things else []), *([LABELS_IMAGE] if self._instances else [])]
+        return {name: images[name] for name in (*truth.images, *others)}
 
     def _geometry(
         self, T_world_cam: PoseFunction, stamp: float, next_stamp: float | None, shutter: Shutter, next_shutter: Shutter
-    ) -> dict[str, Float32Array]:
+    ) -> dict[str, NDArray[Any]]:
         camera, truth = self._camera, self._truth
         reference, now, things, hits = self._cast_frame(T_world_cam, stamp, shutter)
         now = _carrying(now, things, hits)
         images: dict[str, list[Any]] = {}
         if things is not None:
             images[OBJECT_IDS] = [mi.Float(hits.number)]
+        if self._instances is not None:
+            images[LABELS_IMAGE] = [mi.Float(hits.label)]  # whole numbers of 16 bits, exact
         if truth.color_depth:
             images["color_depth"] = [hits.z]
         if truth.normals:
@@ -129,7 +137,10 @@ class TruthRenderer:
         out = {name: np.stack([np.array(c, np.float32) for c in images[name]], axis=-1) for name in images}
         if "next" in truth.flow and next_stamp is None:
             out["flow_next"] = np.zeros((camera.height * camera.width, 3), np.float32)
-        return {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
+        shaped = {name: a.reshape(*shape, *(a.shape[1:] if a.shape[1] > 1 else ())) for name, a in out.items()}
+        if LABELS_IMAGE in shaped:
+            shaped[LABELS_IMAGE] = shaped[LABELS_IMAGE].astype(np.uint16)
+        return shaped
 
     def flow_into(self, T_world_cam: PoseFunction, stamp: float, other: Shutter, other_stamp: float) -> Float32Array:
         """Flow (h, w, 3), u v valid, from the frame at `stamp` (s) into one that the same camera takes with the shutter
@@ -180,8 +191,9 @@ class TruthRenderer:
         w = dr.select(hit.is_valid(), mi.Float(1), 0)
         p = dr.select(hit.is_valid(), mi.Point3f(origin) + hit.t * ray.d, ray.d)
         z = dr.select(hit.is_valid(), hit.t * self._sensor.planar_depth_scale(uv.x, uv.y), 0)
+        label = mi.UInt32(0) if self._instances is None else self._instances.seen_by(hit)
         if things is None:
-            return _PixelHits(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z)
+            return _PixelHits(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z, label=label)
         meeting = things.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
         met, number = meeting.number > 0, meeting.number
         p = dr.select(met, things.place(meeting), p)
@@ -189,7 +201,10 @@ class TruthRenderer:
         _, n_world = things.carried(number, begin + 0.5 * shutter.exposure_s, p, normal)
         z = dr.select(met, meeting.t * self._sensor.planar_depth_scale(uv.x, uv.y), z)
         dr.eval(p, normal, number, z, w)
-        return _PixelHits(uv, begin, p, dr.select(met, 1, w), normal, rotated_back(R_world_cam, n_world), z, number)
+        if self._instances is not None:
+            label = dr.select(met, len(self._instances.names) + number, label)
+        n_cam = rotated_back(R_world_cam, n_world)
+        return _PixelHits(uv, begin, p, dr.select(met, 1, w), normal, n_cam, z, number, label)
 
     def _flow(
         self, hits: _PixelHits, uv: tuple[Any, Any], found: Any, other: MovingCamera, t: Any, reference: FloatArray,
@@ -246,6 +261,7 @@ class _PixelHits:
     n_cam: Any
     z: Any
     number: Any = 0  # of the object, 0 for none
+    label: Any = 0  # number of the thing, of objects after those of the scene; 0 for none
 
 
 def global_instant(camera: Camera, shutter: Shutter, stamp: float, time: GlobalTime) -> float:

@@ -25,7 +25,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
 from scenes.corridor import layout, room  # noqa: E402
 from scenes.corridor.materials import materials  # noqa: E402
 from scenes.kit import room_files  # noqa: E402
-from scenes.kit.pieces import Piece, draw, kelvin, surfaces  # noqa: E402  # noqa: E402
+from scenes.kit.pieces import SHELL, Piece, draw, kelvin  # noqa: E402
 from scenes.kit.prints import town  # noqa: E402
 from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 
@@ -36,7 +36,7 @@ SKY, GROUND = 2.0, 0.6
 def contents(seed: int) -> tuple[list[Piece], list[AreaLamp]]:
     """Everything in the corridor of this seed: the shell and pieces, and what shines."""
     rng = draw(seed, "light")
-    pieces = [Piece("shell", room.shell()), *room.fixtures(), *layout.arrange(seed)]
+    pieces = [Piece(SHELL, room.shell()), *room.fixtures(), *layout.arrange(seed)]
     lamps = []
     colour = kelvin(float(rng.uniform(3800, 6000))) / kelvin(4600)  # as a camera balanced for 4600 K sees it
     dark = int(rng.integers(len(room.LAMPS))) if rng.uniform() < 0.6 else -1
@@ -62,7 +62,7 @@ def build(out: Path, seed: int = 0) -> Path:
     sky = float(draw(seed, "sky").uniform(0.6, 1.1))
     view = (9.5, 1.6, 0.2), (14.5, 1.2, -0.2)
     shown = {"town": town((768, 640), 920 + seed, SKY * sky, GROUND * sky)}
-    return write_room(out, Room(surfaces(pieces), materials(seed), lamps, view, shown))
+    return write_room(out, Room(pieces, materials(seed), lamps, view, shown))
 
 
 if __name__ == "__main__":

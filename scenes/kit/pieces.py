@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from scenes.kit.shapes import Array, Parts, move_parts, rotation
+
+SHELL = "shell"  # the piece that is the room itself
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,29 @@ def stand(name: str, parts: Parts, x: float, y: float, z: float, turn: float = 0
     return Piece(name, move_parts(parts, (x, y, z), rotation("y", turn)))
 
 
-def surfaces(pieces: Iterable[Piece]) -> Parts:
-    """The shapes of all pieces."""
-    return [part for piece in pieces for part in piece.parts]
+def instance_names(pieces: Sequence[Piece]) -> list[str]:
+    """A name of its own for each piece: numbered where several have one; '' of the shell, which materials divide."""
+    count = Counter(piece.name for piece in pieces)
+    seen: Counter[str] = Counter()
+    names = []
+    for piece in pieces:
+        seen[piece.name] += 1
+        number = f" {seen[piece.name]}" if count[piece.name] > 1 else ""
+        names.append("" if piece.name == SHELL else f"{piece.name}{number}")
+    return names
+
+
+def parts_rows(pieces: Sequence[Piece], materials: Iterable[str], prefix: str = "") -> list[str]:
+    """Lines 'shape,first,name' of what each mesh of a material is put together from, in the pieces' order."""
+    rows = []
+    for material in materials:
+        first = 0
+        for name, piece in zip(instance_names(pieces), pieces, strict=True):
+            for used, mesh in piece.parts:
+                if used == material:
+                    rows.append(f"{prefix}{material},{first},{name or material}")
+                    first += len(mesh.f)
+    return rows
 
 
 _GREY = np.array([0.2126, 0.7152, 0.0722])

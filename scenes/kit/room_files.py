@@ -15,7 +15,8 @@ import numpy as np
 
 from rsgen.render.meshes import ply_bytes
 from scenes.kit.materials import Material, texture
-from scenes.kit.shapes import Mesh, Parts, merge
+from scenes.kit.pieces import Piece, parts_rows
+from scenes.kit.shapes import Mesh, merge
 
 Point = tuple[float, float, float]
 ICL_FOV = float(np.degrees(2 * np.arctan(320 / 481.2)))  # width of ICL-NUIM's image, degrees
@@ -119,12 +120,12 @@ def look_at(eye: Point, target: Point) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Room:
-    """A room's surfaces by material, its materials by name, its lamps, and the view that its file opens with.
+    """A room's pieces, its materials by name, its lamps, and the view that its file opens with.
 
     view: eye and target, m. pictures: linear (h, w, 3) images by name, for lamps' radiance.
     """
 
-    surfaces: Parts
+    pieces: Sequence[Piece]
     materials: Mapping[str, Material]
     lamps: Sequence[AreaLamp]
     view: tuple[Point, Point]
@@ -134,18 +135,19 @@ class Room:
 def write_room(out: Path, room: Room) -> Path:
     """Write the room into the folder `out` (made if need be) and return the path of its scene.xml, written last.
 
-    One mesh for all surfaces of a material; pictures as textures/NAME.pfm. Raises OSError if the folder cannot be
-    written, KeyError for a material that is not in the room's.
+    One mesh for all surfaces of a material; parts.csv says which triangles are whose. Pictures are textures/NAME.pfm.
+    Raises OSError if the folder cannot be written, KeyError for a material that is not in the room's.
     """
     materials = room.materials
     (out / "scene.xml").unlink(missing_ok=True)
     for folder in ("meshes", "textures"):
         shutil.rmtree(out / folder, ignore_errors=True)
         (out / folder).mkdir(parents=True)
-    used = sorted({name for name, _ in room.surfaces} | {lamp.material for lamp in room.lamps})
+    surfaces = [part for piece in room.pieces for part in piece.parts]
+    used = sorted({name for name, _ in surfaces} | {lamp.material for lamp in room.lamps})
     shapes = []
     for name in used:
-        own = [mesh for material, mesh in room.surfaces if material == name]
+        own = [mesh for material, mesh in surfaces if material == name]
         if own:
             write_ply(out / "meshes" / f"{name}.ply", merge(own), materials[name].tile)
             shapes.append(shape(name, name))
@@ -160,6 +162,7 @@ def write_room(out: Path, room: Room) -> Path:
     for name, image in room.pictures.items():
         write_pfm(out / "textures" / f"{name}.pfm", image)
     bsdfs = [bsdf(name, materials[name]) for name in used]
+    (out / "parts.csv").write_text("\n".join(["shape,first,name", *parts_rows(room.pieces, used), ""]))
     path = out / "scene.xml"
     path.write_text(document(bsdfs, shapes, look_at(*room.view), ICL_FOV))
     return path

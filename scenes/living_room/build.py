@@ -24,7 +24,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
 from scenes.kit import room_files  # noqa: E402
-from scenes.kit.pieces import Piece, surfaces  # noqa: E402
+from scenes.kit.pieces import SHELL, Piece  # noqa: E402
 from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 from scenes.living_room import layout, pictures, room  # noqa: E402
 from scenes.living_room.materials import MATERIALS  # noqa: E402
@@ -39,7 +39,7 @@ def contents() -> tuple[list[Piece], list[AreaLamp]]:
     """Everything in the room: the shell and pieces, and what shines."""
     furniture, shades = layout.furnishing()
     housings, discs = room.spots()
-    pieces = [Piece("shell", room.architecture()), Piece("spots", housings), Piece("furniture", furniture)]
+    pieces = [Piece(SHELL, room.architecture()), Piece("spots", housings), *furniture]
     shade = room_files.radiance(SHADE_RADIANCE)
     lamps = [AreaLamp(f"lamp_shade_{i}", "shade", mesh, shade) for i, mesh in enumerate(shades)]
     lamps += [
@@ -58,7 +58,7 @@ def build(out: Path) -> Path:
     pieces, lamps = contents()
     view = (-1.6, 1.55, 1.9), (0.7, 0.75, -0.9)
     garden = pictures.garden((512, 512), 901, SKY, GROUND)
-    return write_room(out, Room(surfaces(pieces), MATERIALS, lamps, view, {"garden": garden}))
+    return write_room(out, Room(pieces, MATERIALS, lamps, view, {"garden": garden}))
 
 
 if __name__ == "__main__":

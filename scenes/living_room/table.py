@@ -21,7 +21,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
 from scenes.kit import materials  # noqa: E402
-from scenes.kit.pieces import Piece  # noqa: E402
+from scenes.kit.pieces import Piece, parts_rows  # noqa: E402
 from scenes.kit.room_files import command, write_ply  # noqa: E402
 from scenes.kit.shapes import Parts, merge, move_parts, rotation  # noqa: E402
 from scenes.living_room import build as room  # noqa: E402
@@ -96,7 +96,8 @@ def build(out: Path) -> Path:
     folder = out / "objects"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    parts = [part for thing in things() for part in thing.parts]
+    pieces = things()
+    parts = [part for thing in pieces for part in thing.parts]
     lines = ['<scene version="3.0.0">', '  <include filename="scene.xml"/>']
     for name, material in OBJECT_MATERIALS.items():
         write_ply(folder / f"{name}.ply", merge([m for used, m in parts if used == name]), material.tile)
@@ -110,6 +111,8 @@ def build(out: Path) -> Path:
             f'  <shape type="ply" id="table_mesh_{name}"><string name="filename" value="objects/{name}.ply"/>'
             f'<ref id="table_{name}"/></shape>',
         ]
+    rows = parts_rows(pieces, OBJECT_MATERIALS, "table_mesh_")
+    (out / "parts_table.csv").write_text("\n".join(["shape,first,name", *rows, ""]))
     path = out / "table.xml"
     path.write_text("\n".join([*lines, "</scene>", ""]))
     return path

@@ -23,7 +23,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
 from scenes.kit import room_files  # noqa: E402
-from scenes.kit.pieces import Piece, draw, kelvin, surfaces  # noqa: E402  # noqa: E402
+from scenes.kit.pieces import SHELL, Piece, draw, kelvin  # noqa: E402
 from scenes.kit.prints import town  # noqa: E402
 from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 from scenes.office import layout, pictures, room  # noqa: E402
@@ -38,7 +38,7 @@ def contents(seed: int) -> tuple[list[Piece], list[AreaLamp]]:
     """Everything in the office of this seed: the shell and pieces, and what shines."""
     arrangement = layout.arrange(seed)
     rng = draw(seed, "light")
-    pieces = [Piece("shell", room.shell()), *room.fixtures(rng), *arrangement.pieces]
+    pieces = [Piece(SHELL, room.shell()), *room.fixtures(rng), *arrangement.pieces]
     colour = kelvin(float(rng.uniform(3800, 6000))) / kelvin(4600)  # as a camera balanced for 4600 K sees it
     on = rng.uniform(size=len(room.PANELS)) > 0.15
     on[[0, 4, 6]] = True
@@ -72,7 +72,7 @@ def build(out: Path, seed: int = 0) -> Path:
         "screens": SCREEN_RADIANCE * pictures.screens((640, 2048), 900 + seed),
         "town": town((512, 768), 910 + seed, SKY * sky, GROUND * sky),
     }
-    return write_room(out, Room(surfaces(pieces), materials(seed), lamps, view, shown))
+    return write_room(out, Room(pieces, materials(seed), lamps, view, shown))
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ if str(_ROOT) not in sys.path:  # so that it also runs as a script from anywhere
     sys.path.insert(0, str(_ROOT))
 
 from scenes.kit import room_files  # noqa: E402
-from scenes.kit.pieces import Piece, surfaces  # noqa: E402
+from scenes.kit.pieces import SHELL, Piece  # noqa: E402
 from scenes.kit.room_files import AreaLamp, Room, command, write_room  # noqa: E402
 from scenes.workshop import drawings, hall, layout  # noqa: E402
 from scenes.workshop.materials import materials  # noqa: E402
@@ -43,7 +43,7 @@ def contents(seed: int) -> tuple[list[Piece], list[AreaLamp]]:
     """Everything in the hall of this seed: the shell and pieces, and what shines."""
     housings, discs = layout.lamps(seed)
     pieces = [
-        Piece("shell", [*hall.floor(layout.bays()), *hall.shell()]),
+        Piece(SHELL, [*hall.floor(layout.bays()), *hall.shell()]),
         Piece("bars", hall.window_bars(), "building"),
         Piece("doors", hall.doors(), "building"),
         Piece("steelwork", hall.steelwork(), "building"),
@@ -81,7 +81,7 @@ def build(out: Path, seed: int = 0) -> Path:
         level = day * light
         pictures[f"sky_{name}"] = drawings.sky((64, 1024), 900 + 10 * seed + side, SKY * level, HORIZON * level)
     view = (-8.9, 1.65, 0.6), (0.0, 1.2, -0.8)
-    return write_room(out, Room(surfaces(pieces), materials(seed), lamps, view, pictures))
+    return write_room(out, Room(pieces, materials(seed), lamps, view, pictures))
 
 
 if __name__ == "__main__":

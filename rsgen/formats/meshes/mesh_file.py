@@ -19,7 +19,7 @@ import trimesh
 from PIL import Image
 
 from rsgen import srgb
-from rsgen.array_types import FloatArray
+from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes import gltf
 from rsgen.formats.meshes.default_light import light_shapes
@@ -45,6 +45,11 @@ def read_parts(path: Path, options: SceneOptions) -> list[Part]:
 
     What trimesh's parsers raise on damaged files comes through.
     """
+    return finished(path, [part for _, part in _nodes(path, options)])
+
+
+def _nodes(path: Path, options: SceneOptions) -> list[tuple[str, Part]]:
+    """Nodes that have triangles, by name, in the world."""
     data, header = path.read_bytes(), None
     files = {name: file.read_bytes() for name, file in referenced_files(path).items()}
     if path.suffix.lower() in gltf.SUFFIXES:
@@ -64,8 +69,22 @@ def read_parts(path: Path, options: SceneOptions) -> list[Part]:
         T_file_part, name = loaded.graph[node]
         mesh = loaded.geometry[name]
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
-            parts.append(placed(path, name, reader.part(mesh, name), T_world_file @ T_file_part))
-    return finished(path, parts)
+            parts.append((str(node), placed(path, name, reader.part(mesh, name), T_world_file @ T_file_part)))
+    return parts
+
+
+def named_triangles(path: Path, options: SceneOptions) -> tuple[list[str], FloatArray, IntArray]:
+    """Names of a mesh file's nodes, middles (n, 3) of all their triangles in the world, m, and each one's node (n,).
+
+    Raises UserError as `read_parts`.
+    """
+    names: list[str] = []
+    middles, owner = [], []
+    for name, part in _nodes(path, options):
+        names.append(name)
+        middles.append(part.vertices[part.faces].mean(axis=1))
+        owner.append(np.full(len(part.faces), len(names) - 1))
+    return names, np.concatenate(middles), np.concatenate(owner)
 
 
 def scene_dict(mi: Any, path: Path, scratch: Path, options: SceneOptions) -> dict[str, Any]:

@@ -28,7 +28,7 @@ STUB = (
     '<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>'
     '<shape type="rectangle" id="ground"><ref id="grey"/></shape></scene>'
 )
-FURNITURE = layout.furnishing()[0]
+FURNITURE = [part for piece in layout.furnishing()[0] for part in piece.parts]
 THINGS = {thing.name: thing for thing in table.things()}
 Prism = tuple[np.ndarray, float, float]  # outline (n, 2) of x, z, counter-clockwise; lowest and highest y
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 import tiny
 import yaml
 from scipy.spatial.transform import Rotation
