@@ -9,15 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from rsgen.array_types import UInt16Array
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text, read_yaml
+from rsgen.geometry import se3
 from rsgen.sensors.imu import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_csv, imu_truth_csv
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.format import STREAMS, ground_truth, pose_lines
-from rsgen.sequence.images import Rig, Sequence
+from rsgen.sequence.images import ImageStream, Rig, Sequence
 from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, target_corners_text
 from rsgen.truth.settings import sequence_imu, sequence_target
 
+_BOX_M = 1e-4  # what depth in float32 and a line's rounding leave
 _WORDS = {"color": "colour"}  # names as they are written in words
 
 
@@ -92,16 +95,28 @@ def check_target(sequence: Rig) -> tuple[bool, str]:
 
 
 def check_labels(sequence: Rig) -> tuple[bool, str]:
-    """Every frame has labels of the table, and there is one wherever there is depth. Raises UserError."""
+    """Every frame has labels of the table, and points that depth sees lie in their things' boxes. Raises UserError."""
     seen = np.zeros(len(sequence.label_table) + 1, np.int64)
     for name, stream in sequence.streams.items():
         for k in range(len(stream.paths)):
             labels = sequence.labels(name, k)
             seen += np.bincount(labels.ravel(), minlength=len(seen))
-            if stream.is_depth and ((labels > 0) != (sequence.exact_depth(name, k) > 0)).any():
+            if stream.is_depth and not _within_boxes(sequence, stream, k, labels):
                 return False, f"{sequence.root / stream.files.labels / stream.paths[k].name}: is not of that frame"
     classes = {label.class_name for label in sequence.label_table}
     return True, f"{len(seen) - 1} things of {len(classes)} classes, {int((seen[1:] > 0).sum())} of them seen"
+
+
+def _within_boxes(sequence: Rig, stream: ImageStream, k: int, labels: UInt16Array) -> bool:
+    """Whether something is labelled just where there is depth, and points at rest are in the boxes of their things."""
+    z = sequence.exact_depth(stream.name, k)
+    if ((labels > 0) != (z > 0)).any():
+        return False
+    still = (z > 0) & (labels <= len(sequence.label_table) - len(sequence.objects))
+    uv = stream.camera.pixel_grid()[still]
+    p_world = se3.transform(sequence.pixel_poses(stream.name, k, uv), stream.camera.backproject(uv, z[still]))
+    low, high = np.array([label.box for label in sequence.label_table]).transpose(1, 0, 2)[:, labels[still] - 1]
+    return bool(((p_world >= low - _BOX_M) & (p_world <= high + _BOX_M)).all())
 
 
 def check_objects(sequence: Rig) -> tuple[bool, str]:
