@@ -85,6 +85,13 @@ class DepthNoiseConfig(Section):
     disparity_step_px: Annotated[float, limits(1e-6, 100, "px", or_zero=True)] = Field(
         default=0.125, description="kinect: quantisation step, px; 0: none"
     )
+    region_sigma_px: NoisePixels = Field(
+        default=0.0,
+        description="kinect: noise of the disparity that neighbours have in common, px RMS, anew each frame",
+    )
+    region_px: Annotated[float, limits(1, 1e4, "px")] = Field(
+        default=5.0, description="kinect: how far that noise is alike (to 1/e), px"
+    )
     edge_dropout: Fraction = Field(default=0.5, description="kinect: probability of no return beside a depth edge")
     axial_base_m: Metres = Field(default=0.0012, description="tof: sigma = base + growth (z - nearest)^2; base, m")
     axial_growth_per_m: PerMetre = Field(default=0.0019, description="tof: growth, 1/m")

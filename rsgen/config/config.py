@@ -59,7 +59,7 @@ class Config(Section):
     )
     preset: Preset | None = Field(
         default=None,
-        description="kinect_v1: cameras, noise, exposure, driver, tremor of a hand-held Kinect; other fields override",
+        description="kinect_v1, xtion: cameras, noise, exposure, driver, tremor of these; other fields override",
     )
     trajectory: TrajectoryConfig = TrajectoryConfig()
     motion: MotionConfig | None = None
@@ -177,6 +177,10 @@ class Config(Section):
             if content[section][name] is not None:
                 content[section][name] = Path(content[section][name]).name
         content["truth"] = self.truth.content()
+        for section in content.get("streams", content).values():  # what cameras had no fields for before stays away
+            noise = section.get("noise") if isinstance(section, dict) else None
+            if noise is not None and noise.get("region_sigma_px") == 0:
+                del noise["region_sigma_px"], noise["region_px"]
         if self.imu is not None:
             content["imu"] = self.imu.content()
         if self.objects:

@@ -56,6 +56,9 @@ def _kinect(z: Float32Array, camera: Camera, config: DepthNoiseConfig, rng: np.r
     d = disparity(z, focal_baseline)
     edge = disparity_edges(d)
     noisy = shift_laterally(d, edge, config.lateral_sigma_px, rng)
+    if config.region_sigma_px > 0:
+        common = smooth_field(z.shape, config.region_px, rng)
+        noisy = np.where(noisy > 0, np.maximum(noisy + np.float32(config.region_sigma_px) * common, 0), noisy)
     noisy = quantise_disparity(noisy, config.disparity_sigma_px, config.disparity_step_px, rng)
     lost = grazing_probability(incidence(d, camera), *config.grazing_deg)
     lost = np.where(edge, 1 - (1 - lost) * np.float32(1 - config.edge_dropout), lost)
@@ -73,6 +76,17 @@ def _time_of_flight(
     mixed = mix_edges(z, disparity_edges(d), config.flying_pixels, rng)
     kept = rng.random(z.shape, np.float32) >= grazing_probability(angle, *config.grazing_deg)
     return np.where(kept, mixed + sigma * rng.standard_normal(z.shape, np.float32), np.float32(0))
+
+
+def smooth_field(shape: tuple[int, ...], length_px: float, rng: np.random.Generator) -> Float32Array:
+    """Normal values (h, w) of unit variance, whose correlation falls as exp(-(distance / length_px)^2).
+
+    White noise through a Gaussian of sigma s has the correlation exp(-distance^2 / 4 s^2) and the variance 1 / 4 pi s^2.
+    """
+    sigma = length_px / 2
+    white = rng.standard_normal(shape, np.float32)
+    smooth = cv2.GaussianBlur(white, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(smooth * np.float32(2 * np.sqrt(np.pi) * sigma))
 
 
 def disparity(z: Float32Array, focal_baseline: float) -> Float32Array:
