@@ -81,7 +81,7 @@ def _time_of_flight(
 def smooth_field(shape: tuple[int, ...], length_px: float, rng: np.random.Generator) -> Float32Array:
     """Normal values (h, w) of unit variance, whose correlation falls as exp(-(distance / length_px)^2).
 
-    White noise through a Gaussian of sigma s has the correlation exp(-distance^2 / 4 s^2) and the variance 1 / 4 pi s^2.
+    White noise through a Gaussian of sigma s has that correlation for a length of 2 s, and the variance 1 / 4 pi s^2.
     """
     sigma = length_px / 2
     white = rng.standard_normal(shape, np.float32)

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from rendering import SCANS, constant_twist, mi, pixel_rays, pixel_times
 
 from rsgen.config.cameras import DepthNoiseConfig
+from rsgen.config.presets import with_presets
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -335,3 +336,29 @@ def test_nothing_is_lit_where_nothing_is() -> None:
     z = renderer.render(still, 0.0)
     lit = Projector(empty, renderer.sensor, BASELINE).lights(z, still, 0.0)
     assert (z == 0).any() and not lit[z == 0].any() and lit[z > 0].mean() > 0.6
+
+
+def test_what_neighbours_have_in_common_has_its_size_and_reach() -> None:
+    field = np.stack([depth.smooth_field((240, 320), 6.0, np.random.default_rng(k)) for k in range(6)]).astype(float)
+    assert field.var() == pytest.approx(1.0, rel=0.05)
+    for lag in (3, 6, 12):
+        alike = [(field[:, :, :-lag] * field[:, :, lag:]).mean(), (field[:, :-lag] * field[:, lag:]).mean()]
+        np.testing.assert_allclose(alike, np.exp(-((lag / 6.0) ** 2)), atol=0.03)
+
+
+def test_regional_noise_moves_a_wall_by_its_size_and_is_off_by_default() -> None:
+    camera = Camera(320, 240, 570.0, 570.0, 159.5, 119.5)
+    z = np.full((240, 320), 3.0, np.float32)
+    plain = DepthNoiseConfig(model="kinect", lateral_sigma_px=0, disparity_sigma_px=0, disparity_step_px=0)
+    exact = apply_depth_noise(z, camera, plain, noise_generator(1, "depth", 0))
+    common = plain.model_copy(update={"region_sigma_px": 0.1})
+    moved = apply_depth_noise(z, camera, common, noise_generator(1, "depth", 0))
+    np.testing.assert_allclose(exact[exact > 0], 3.0, rtol=1e-6)
+    shift = (570.0 * 0.075 / moved[moved > 0].astype(float)) - 570.0 * 0.075 / 3.0
+    assert shift.std() == pytest.approx(0.1, rel=0.1)
+
+
+def test_the_xtion_reaches_farther_than_the_kinect() -> None:
+    kinect, xtion = (with_presets({"preset": name})["depth"]["noise"] for name in ("kinect_v1", "xtion"))
+    assert (kinect["max_range_m"] if "max_range_m" in kinect else 8.0) < xtion["max_range_m"] == 10.0
+    assert DepthNoiseConfig.model_validate(xtion).region_sigma_px > 0 and "region_sigma_px" not in kinect
