@@ -84,9 +84,10 @@ def smooth_field(shape: tuple[int, ...], length_px: float, rng: np.random.Genera
     White noise through a Gaussian of sigma s has that correlation for a length of 2 s, and the variance 1 / 4 pi s^2.
     """
     sigma = length_px / 2
-    white = rng.standard_normal(shape, np.float32)
-    smooth = cv2.GaussianBlur(white, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101)
-    return np.asarray(smooth * np.float32(2 * np.sqrt(np.pi) * sigma))
+    margin = int(np.ceil(4 * sigma))  # what the Gaussian reaches: at the border nothing is counted twice
+    white = rng.standard_normal([size + 2 * margin for size in shape], np.float32)
+    smooth = np.asarray(cv2.GaussianBlur(white, (2 * margin + 1, 2 * margin + 1), sigma))
+    return smooth[margin:-margin, margin:-margin] * np.float32(2 * np.sqrt(np.pi) * sigma)
 
 
 def disparity(z: Float32Array, focal_baseline: float) -> Float32Array:

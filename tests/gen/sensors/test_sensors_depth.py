@@ -360,5 +360,5 @@ def test_regional_noise_moves_a_wall_by_its_size_and_is_off_by_default() -> None
 
 def test_the_xtion_reaches_farther_than_the_kinect() -> None:
     kinect, xtion = (with_presets({"preset": name})["depth"]["noise"] for name in ("kinect_v1", "xtion"))
-    assert (kinect["max_range_m"] if "max_range_m" in kinect else 8.0) < xtion["max_range_m"] == 10.0
+    assert kinect.get("max_range_m", 8.0) < xtion["max_range_m"] == 10.0
     assert DepthNoiseConfig.model_validate(xtion).region_sigma_px > 0 and "region_sigma_px" not in kinect
