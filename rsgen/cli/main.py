@@ -7,9 +7,11 @@ in boxes, pydantic-settings in tracebacks, and repairing that would take as much
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from rsgen.cli.motion import fit, stats, suggest
@@ -38,6 +40,7 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
 A config is a YAML file or a name. Scenes are built, and their light is baked, once: in a checkout beside their scripts,
 otherwise in $XDG_CACHE_HOME/rsgen (~/.cache/rsgen).
 """
+_OF_CAMERA = re.compile(r"--streams(\.\w+){2,}")
 # What became of commands that were.
 _MOVED = {
     "configs": "scenes",
@@ -55,22 +58,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Parser(Parser):
-    """Names the new option of a field of the config that has moved."""
+    """Names the new option of a field of the config that has moved; takes any camera's fields, --streams.NAME.FIELD."""
+
+    with_fields: Mapping[str, argparse.ArgumentParser] = MappingProxyType({})
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         from rsgen.config.faults import moved_to
 
+        command = self.with_fields.get(args[0]) if args else None
         for word in args or ():
             name = word.partition("=")[0]
             if name.startswith("--") and (now := moved_to(name[2:])) is not None:
                 self.error(f"{name}: is now --{now}")
+            # What cameras a rig has only its config says, which checks them.
+            if command is not None and _OF_CAMERA.fullmatch(name) and name not in command._option_string_actions:
+                command.add_argument(name, action=_Field, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         return super().parse_args(args, namespace)
 
 
 @cache  # of some hundred options: whoever calls `main` often would wait for it each time
 def _parser() -> Parser:
     raw = argparse.RawDescriptionHelpFormatter
-    commands = Commands("rsgen", _DESCRIPTION, _Parser("rsgen", description=_DESCRIPTION, formatter_class=raw))
+    program = _Parser("rsgen", description=_DESCRIPTION, formatter_class=raw)
+    commands = Commands("rsgen", _DESCRIPTION, program)
     add = commands.add
     add(scenes, "", "workshop", "workshop --seed 3 --out rooms/workshop3")
     add(import_, "room.blend scenes/room")
@@ -89,6 +99,7 @@ def _parser() -> Parser:
     with_fields += [add(pack, "demo office1 --count 1000 --out packs/rooms --color.spp 8 --truth.spp 8")]
     for command in with_fields:
         _add_fields(command)
+    program.with_fields = {command.prog.split()[-1]: command for command in with_fields}
     return commands.parser
 
 

@@ -267,7 +267,10 @@ def _set(data: dict[str, Any], key: str, text: str) -> None:
 
 
 def _problem(error: Any) -> str:
-    where = ".".join(str(part) for part in error["loc"]) or "config"
+    parts = list(error["loc"])
+    if parts[:1] == ["streams"] and len(parts) > 2:
+        del parts[2]  # which of the kinds of cameras it was taken for
+    where = ".".join(map(str, parts)) or "config"
     message = error["msg"].removeprefix("Value error, ")
     if error["type"] == "extra_forbidden":
         if (now := moved_to(where)) is not None:

@@ -285,3 +285,12 @@ def test_a_damaged_rig_is_one_line(root: Path, tmp_path: Path) -> None:
         with pytest.raises(UserError, match="streams") as error:
             read_sequence(broken)
         assert "\n" not in str(error.value)
+
+
+def test_fields_of_a_camera_are_options(config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["render", str(config), "--out", str(tmp_path / "seq"), "--frames", "0:1", "--quiet"]
+    assert main([*words, "--streams.range.readout_s", "0", "--streams.front.noise.model=none"]) == 0
+    made = read_rig(tmp_path / "seq")
+    assert made.streams["range"].shutter.readout_s == 0 and made.meta["noise"]["front"] == "none"
+    assert main([*words, "--streams.range.colour", "0"]) == 2
+    assert "streams.range.colour: no such field" in capsys.readouterr().err
