@@ -19,7 +19,7 @@ from rstrack.report.page import Block, Chooser, ImageRow, Note, Page, PageImage,
 from rstrack.score.scores import FIGURES, Scores, SequenceScored
 from rstrack.score.suite import SuiteEntry
 
-_BY_READOUT = ("ate_mm", "drift_mm_s", "drift_deg_s")
+_BY_READOUT = ("ate_mm", "drift_mm_s")
 _ABOUT = (
     "Means over all sequences of the tier. A method has one only where it is scored on every one of them; what is "
     "missing, lost (fewer than half of the frames have a pose) or failed is counted in the last column and named "
@@ -43,7 +43,7 @@ def leaderboard(scores: Scores) -> Page:
     sections.append(PageSection("sequences", "Sequence by sequence", (_by_sequence(scores),)))
     if pictures := [picture for name in _groups(scores) if (picture := _by_readout(scores, name)) is not None]:
         note = Note("Sequences that differ in their cameras' readout alone. A line is broken where a track is lost.")
-        sections.append(PageSection("readout", "By readout", (note, ImageRow(tuple(pictures)))))
+        sections.append(PageSection("readout", "By readout", (note, *(ImageRow((p,)) for p in pictures))))
     sections.append(PageSection("methods", "Methods", (_methods(scores), Note(_OWN))))
     if gaps := scores.gaps:
         sections.append(PageSection("gaps", "Not scored, and why", tuple(Note(line) for line in gaps)))
@@ -126,11 +126,14 @@ def _groups(scores: Scores) -> tuple[str, ...]:
 def _by_readout(scores: Scores, group: str) -> PageImage | None:
     """Errors over the readout of a group's sequences; None where no method has any."""
     ladder = sorted((s for s in scores.sequences if s.entry.group == group and s.readout_ms is not None), key=_readout)
-    colors, x = method_colors(method.key for method in scores.methods), numbers([s.readout_ms for s in ladder])
+    keys, x = [method.key for method in scores.methods], numbers([s.readout_ms for s in ladder])
+    colors = method_colors(keys)
+    # There are fewer colours than methods may be.
+    dashed = {key for k, key in enumerate(keys) if colors[key] in {colors[other] for other in keys[:k]}}
     charts = []
     for name in _BY_READOUT:
         curves = tuple(
-            Curve(method.name, colors[method.key], x, y, has_points=True)
+            Curve(method.name, colors[method.key], x, y, method.key in dashed, has_points=True)
             for method in scores.methods
             for values in [[scores.of(s.entry.name, method.key).value(name) for s in ladder]]
             if any(value is not None for value in values)
@@ -151,7 +154,7 @@ def _readout(scored: SequenceScored) -> float:
 def _svg_uri(charts: Sequence[Chart]) -> str:
     with TemporaryDirectory() as folder:
         file = Path(folder) / "charts.svg"
-        write_charts(charts, file, columns=len(charts), one_legend=True)
+        write_charts(charts, file, one_legend=True)
         return "data:image/svg+xml;base64," + base64.b64encode(file.read_bytes()).decode("ascii")
 
 

@@ -170,7 +170,7 @@ def test_the_baselines_script_tracks_what_an_experiment_lists(rows_are_known: bo
     T = se3.from_quat_trans(values[:, 4:], values[:, 1:4])
     T_true = synthetic.make_spline().pose(values[:, 0] / 1e9) @ se3.inverse(synthetic.T_COLOR_DEPTH)
     off = se3.inverse(se3.inverse(T_true[0]) @ T_true) @ (se3.inverse(T[0]) @ T)
-    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < (0.01 if rows_are_known else 0.1)
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < (0.02 if rows_are_known else 0.1)
 
 
 def test_without_rows_times_the_calibration_is_read(plain: Sequence, tmp_path: Path) -> None:
