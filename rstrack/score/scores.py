@@ -20,6 +20,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.reader import Sequence as RsgenSequence
+from rstrack.bench.measures.track import consistency_of, errors_of
 from rstrack.bench.record import Figures, counts
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import Estimate, plain, read_estimate
@@ -169,23 +170,10 @@ def score_result(dataset: Dataset, truth: Truth, result: Result, about: About) -
         estimate = Estimate(estimate.stamps, _scaled(estimate.T_world_depth, scale))
         notes.append(f"positions times {scale:.4g}, the scale that fits best")
     found = evaluate(truth, estimate)
-    figures: Figures = {
-        "frames": found.frames,
-        "lost": found.frames - found.frames_tracked,
-        "tracked_pct": 100.0 * found.coverage,
-        "ate_mm": 1e3 * found.ate_rmse_m,
-        "drift_mm_s": _thousandfold(found.rpe_trans_rmse_m_per_s),
-        "drift_deg_s": found.rpe_rot_rmse_deg_per_s,
-        "line_mm": _thousandfold(found.row_rmse_m),
-        "line_deg": found.row_rot_rmse_deg,
-        "nees": found.nees,
-        **_nees_first(truth, estimate, result, T_given_depth, about),
-        **_times(estimate, result, about),
-    }
-    if counts(figures):
-        return Score("scored", "", figures, (*found.notes, *notes))
-    tracked = f"{found.frames_tracked} of {found.frames} frames have a pose"
-    return Score("lost", tracked, figures, (*found.notes, *notes))
+    figures = errors_of(found) | consistency_of(found) | {"tracked_pct": 100.0 * found.coverage}
+    figures |= _nees_first(truth, estimate, result, T_given_depth, about) | _times(estimate, result, about)
+    reason = "" if counts(figures) else f"{found.frames_tracked} of {found.frames} frames have a pose"
+    return Score("lost" if reason else "scored", reason, figures, (*found.notes, *notes))
 
 
 def camera_from_depth(dataset: Dataset) -> FloatArray:
@@ -271,7 +259,3 @@ def _scaled(T: FloatArray, scale: float) -> FloatArray:
     out = T.copy()
     out[:, :3, 3] *= scale
     return out
-
-
-def _thousandfold(value: float | None) -> float | None:
-    return None if value is None else 1e3 * value
