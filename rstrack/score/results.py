@@ -73,7 +73,7 @@ def find_methods(folders: Sequence[Path], sequences: Sequence[str]) -> tuple[Met
     for folder in folders:
         if not folder.is_dir():
             raise UserError(f"{folder}: no such folder: give one with METHOD/SEQUENCE.txt, or a run of 'rstrack track'")
-        before = sum(len(method.results) + len(method.unknown) for method in found.values())
+        before = sum(len(method.results) for method in found.values())
         for key, sequence, result in _results(folder, sequences):
             method = found.get(key) or MethodResults(key, _about(result.path.parent))
             if sequence not in sequences:
@@ -83,8 +83,11 @@ def find_methods(folders: Sequence[Path], sequences: Sequence[str]) -> tuple[Met
                 other = method.results[sequence].path
                 raise UserError(f"{result.path}: is a second result of {key} for {sequence}, beside {other}: give one")
             found[key] = replace(method, results=method.results | {sequence: result})
-        if sum(len(method.results) + len(method.unknown) for method in found.values()) == before:
-            raise UserError(f"{folder}: holds no results: put trajectories at METHOD/SEQUENCE.txt (TUM) in it")
+        if sum(len(method.results) for method in found.values()) == before:
+            raise UserError(
+                f"{folder}: holds no results of {', '.join(sequences[:3])}{', ...' if sequences[3:] else ''}: "
+                "put trajectories at METHOD/SEQUENCE.txt (TUM) in it"
+            )
     return tuple(found.values())
 
 
@@ -137,21 +140,21 @@ def read_covariances(path: Path) -> tuple[Estimate, FloatArray]:
 
 
 def _results(folder: Path, sequences: Sequence[str]) -> Iterator[tuple[str, str, Result]]:
-    """Method, sequence and files of all that a folder holds."""
+    """Method, sequence and files of all that a folder holds; no sequence: of a method's folder that holds nothing."""
     if (cells := folder / "cells/track").is_dir():
         for run in sorted(path.parent for path in cells.glob(f"*/*/{TRAJECTORY}")):
             yield run.name, run.parent.name, Result(run)
     elif (folder / TRAJECTORY).is_file():
         yield _run(folder, sequences)
-    elif _is_method(folder):
+    elif (
+        (folder / METHOD).is_file()
+        or any(file.stem in sequences for file in folder.glob("*.txt"))
+        or any(folder.glob(f"*/{TRAJECTORY}"))
+    ):
         yield from _method(folder, sequences)
     else:
-        for inner in sorted(path for path in folder.iterdir() if path.is_dir() and _is_method(path)):
-            yield from _method(inner, sequences)
-
-
-def _is_method(folder: Path) -> bool:
-    return any(folder.glob("*.txt")) or any(folder.glob(f"*/{TRAJECTORY}"))
+        for inner in sorted(path for path in folder.glob("[!.]*") if path.is_dir()):
+            yield from list(_method(inner, sequences)) or [(inner.name, "", Result(inner))]
 
 
 def _method(folder: Path, sequences: Sequence[str]) -> Iterator[tuple[str, str, Result]]:

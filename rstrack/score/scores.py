@@ -102,7 +102,7 @@ class Scores:
             for sequence in (s.entry.name for s in self.sequences if s.entry.name not in bad):
                 score = self.of(sequence, method.key)
                 lines += [f"{method.name}, {sequence}: {score.reason}"] if score.reason else []
-            lines += [f"{path}: is of no sequence of the suite: not scored" for path in method.unknown]
+            lines += [f"{path}: holds no trajectory of a sequence of the suite" for path in method.unknown]
         return lines
 
     def as_dict(self) -> dict[str, Any]:
@@ -150,7 +150,7 @@ def score_suite(suite: Suite, methods: Sequence[MethodResults], progress: Progre
             else:
                 try:
                     score = score_result(dataset, truth, result, method.about)
-                except UserError as error:
+                except (UserError, np.linalg.LinAlgError) as error:  # a covariance that is singular
                     score = Score("failed", str(error))
             found[entry.name, method.key] = score
     progress("scoring", 1.0, "")

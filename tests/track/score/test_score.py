@@ -177,6 +177,9 @@ def test_results_are_found_wherever_they_lie(suite: Path, tmp_path: Path) -> Non
         write(several / file, stamps, T)
     (several / "orb/method.yaml").write_text("name: ORB\nurl: https://a.b\ncamera: color\n")
     (several / "orb/slow.times").write_text("3\n")
+    (several / "readme.txt").write_text("how it was made")
+    (several / "svo").mkdir()
+    (several / "svo/slow.csv").touch()
     run = make_run(tmp_path / "runs/first", suite / "fast", method="gs-pg")
     make_run(tmp_path / "mine/slow", suite / "slow", method="ignored: the folder says")
     (tmp_path / "mine/method.yaml").write_text("note: tuned\n")
@@ -185,17 +188,18 @@ def test_results_are_found_wherever_they_lie(suite: Path, tmp_path: Path) -> Non
     folders = [several, run, tmp_path / "mine", tmp_path / "bench"]
     found = {method.key: method for method in find_methods(folders, names)}
     assert {key: sorted(method.results) for key, method in found.items()} == {
-        "dso": ["slow"], "orb": ["fast", "slow"], "gs-pg": ["fast"], "mine": ["slow"], "rs-pg-no-fuse": ["fast"],
+        "dso": ["slow"], "orb": ["fast", "slow"], "svo": [], "gs-pg": ["fast"], "mine": ["slow"],
+        "rs-pg-no-fuse": ["fast"],
     }  # fmt: skip
     assert found["orb"].name == "ORB" and found["orb"].about.camera == "color" and found["mine"].about.note == "tuned"
     assert found["orb"].results["slow"] == Result(several / "orb/slow.txt", times=several / "orb/slow.times")
-    assert found["dso"].unknown == (several / "dso/slwo.txt",)
+    assert found["dso"].unknown == (several / "dso/slwo.txt",) and found["svo"].unknown == (several / "svo",)
     assert find_methods([several / "orb"], names)[0].results == found["orb"].results
 
     with pytest.raises(UserError, match="second result of gs-pg for fast"):
         find_methods([run, make_run(tmp_path / "again", suite / "fast", method="gs-pg")], names)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UserError, match=r"holds no results: put trajectories at METHOD/SEQUENCE\.txt"):
+    with pytest.raises(UserError, match=r"holds no results of slow, fast: put trajectories at METHOD/SEQUENCE\.txt"):
         find_methods([tmp_path / "empty"], names)
     (several / "orb/method.yaml").write_text("url: javascript:alert(1)\n")
     with pytest.raises(UserError, match=r"method.yaml: url"):
@@ -281,6 +285,9 @@ def test_the_command_scores_what_is_there_and_tells_what_is_not(
     assert (tmp_path / "board/index.html").is_file()
 
     (tmp_path / "results/other/slow.txt").unlink()
+    assert main([*words, "--only", "small"]) == 1
+    assert "other: holds no trajectory of a sequence" in capfd.readouterr().err
+    (tmp_path / "results/other").rmdir()
     assert main([*words, "--only", "small"]) == 0
     assert main(["score", str(suite), "--out", str(tmp_path / "board")]) == 2
     assert "no results to score" in capfd.readouterr().err
