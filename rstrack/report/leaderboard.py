@@ -16,6 +16,7 @@ from rstrack.bench.figures import figure_of, heading
 from rstrack.charts.chart import Chart, Curve, method_colors, numbers
 from rstrack.charts.to_file import write_charts
 from rstrack.report.page import Block, Chooser, ImageRow, Note, Page, PageImage, PageSection, Sortable
+from rstrack.score.results import MethodResults
 from rstrack.score.scores import FIGURES, Scores, SequenceScored
 from rstrack.score.suite import SuiteEntry
 
@@ -23,7 +24,7 @@ _BY_READOUT = ("ate_mm", "drift_mm_s")
 _ABOUT = (
     "Means over all sequences of the tier. A method has one only where it is scored on every one of them; what is "
     "missing, lost (fewer than half of the frames have a pose) or failed is counted in the last column and named "
-    "below. Green: the best. Click a heading to sort."
+    "below. Errors of a line need a spline, NEES needs covariances. Green: the best. Click a heading to sort."
 )
 _OWN = (
     "To add a method: track the sequences with it, put its poses at METHOD/SEQUENCE.txt (TUM: stamp tx ty tz qx qy qz "
@@ -52,7 +53,7 @@ def leaderboard(scores: Scores) -> Page:
         subtitle=f"{words}: {len(suite.entries)} sequences, {len(scores.methods)} methods",
         cards=(),
         sections=tuple(sections),
-        warnings=() if not gaps else (f"{len(gaps)} results are not scored: see the end of the page.",),
+        warnings=() if not gaps else (f"Not scored: {len(gaps)}. The end of the page says what, and why.",),
     )
 
 
@@ -71,7 +72,7 @@ def _tier(scores: Scores, tier: str) -> tuple[Block, ...]:
 def _tier_table(scores: Scores, tier: str) -> Table:
     """A row a method, in the order of their ATE; columns that nobody has a figure for are left out."""
     names = [n for n in FIGURES if any(s.value(n) is not None for s in scores.by_name.values())]
-    methods = sorted(scores.methods, key=lambda m: _last(scores.mean(tier, m.key, "ate_mm")))
+    methods = _ranked(scores, tier)
     columns = [_marked(name, [scores.mean(tier, m.key, name) for m in methods]) for name in names]
     rows: list[tuple[Entry | str, ...]] = []
     for k, method in enumerate(methods):
@@ -90,16 +91,22 @@ def _by_sequence(scores: Scores) -> Chooser:
 def _sequence_table(scores: Scores, name: str) -> Table:
     """A row a sequence, a column a method; a word where there is no figure."""
     rows: list[tuple[Entry | str, ...]] = []
+    methods = _ranked(scores, scores.suite.tiers[0])
     for s in scores.sequences:
-        found = [scores.of(s.entry.name, method.key) for method in scores.methods]
+        found = [scores.of(s.entry.name, method.key) for method in methods]
         marked = _marked(name, [score.value(name) for score in found])
         shown = [
             Entry(score.status) if entry.text == NOTHING and score.status != "scored" else entry
             for score, entry in zip(found, marked, strict=True)
         ]
         rows.append((Entry(s.entry.name, note=_counted_as(s.entry)), significant(s.readout_ms), *shown))
-    head = ("sequence", "readout, ms", *(method.name for method in scores.methods))
-    return Table(head, tuple(rows))
+    return Table(("sequence", "readout, ms", *(method.name for method in methods)), tuple(rows))
+
+
+def _ranked(scores: Scores, tier: str) -> list[MethodResults]:
+    """The methods by their mean ATE over a tier, those without last."""
+    means = {method.key: scores.mean(tier, method.key, "ate_mm") for method in scores.methods}
+    return sorted(scores.methods, key=lambda method: math.inf if (m := means[method.key]) is None else m)
 
 
 def _counted_as(entry: SuiteEntry) -> str:
@@ -169,7 +176,3 @@ def _methods(scores: Scores) -> Table:
         for m in scores.methods
     )
     return Table(("method", "poses are", "alignment", "note"), rows, words=(0, 1, 2, 3))
-
-
-def _last(value: float | None) -> float:
-    return math.inf if value is None else value
