@@ -19,7 +19,7 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.sequence.reader import Sequence as RsgenSequence
+from rsgen.sequence.images import Sequence as RsgenSequence
 from rstrack.bench.measures.track import consistency_of, errors_of
 from rstrack.bench.record import Figures, counts
 from rstrack.data.dataset import Dataset, open_dataset
