@@ -15,7 +15,7 @@ from rsgen.console.tables import NOTHING, Entry, Table, best_marked, significant
 from rstrack.bench.figures import figure_of, heading
 from rstrack.charts.chart import Chart, Curve, method_colors, numbers
 from rstrack.charts.to_file import write_charts
-from rstrack.report.page import Block, Chooser, ImageRow, Note, Page, PageImage, PageSection, Sortable
+from rstrack.report.page import Chooser, ImageRow, Note, Page, PageImage, PageSection, Sortable
 from rstrack.score.results import MethodResults
 from rstrack.score.scores import FIGURES, Scores, SequenceScored
 from rstrack.score.suite import SuiteEntry
@@ -38,10 +38,13 @@ def leaderboard(scores: Scores) -> Page:
     suite = scores.suite
     words = " ".join(word for word in (suite.name, suite.version) if word)
     sections = [
-        PageSection(f"tier{k}", f"Tier {tier}" if tier != "all" else "Overall", _tier(scores, tier))
+        PageSection(f"tier{k}", f"Tier {tier}" if tier != "all" else "Overall", (Note(_ABOUT), Sortable(table)))
         for k, tier in enumerate(suite.tiers)
+        for table in [_tier_table(scores, tier)]
     ]
-    sections.append(PageSection("sequences", "Sequence by sequence", (_by_sequence(scores),)))
+    names = _figures(scores) or FIGURES[:1]
+    by_figure = Chooser("Figure", tuple((heading(n), (Sortable(_sequence_table(scores, n)),)) for n in names))
+    sections.append(PageSection("sequences", "Sequence by sequence", (by_figure,)))
     if pictures := [picture for name in _groups(scores) if (picture := _by_readout(scores, name)) is not None]:
         note = Note("Sequences that differ in their cameras' readout alone. A line is broken where a track is lost.")
         sections.append(PageSection("readout", "By readout", (note, *(ImageRow((p,)) for p in pictures))))
@@ -65,14 +68,14 @@ def summary(scores: Scores) -> str:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _tier(scores: Scores, tier: str) -> tuple[Block, ...]:
-    return Note(_ABOUT), Sortable(_tier_table(scores, tier))
+def _figures(scores: Scores) -> tuple[str, ...]:
+    """Those that anybody has."""
+    return tuple(n for n in FIGURES if any(s.value(n) is not None for s in scores.by_name.values()))
 
 
 def _tier_table(scores: Scores, tier: str) -> Table:
-    """A row a method, in the order of their ATE; columns that nobody has a figure for are left out."""
-    names = [n for n in FIGURES if any(s.value(n) is not None for s in scores.by_name.values())]
-    methods = _ranked(scores, tier)
+    """A row a method, in the order of their ATE."""
+    names, methods = _figures(scores), _ranked(scores, tier)
     columns = [_marked(name, [scores.mean(tier, m.key, name) for m in methods]) for name in names]
     rows: list[tuple[Entry | str, ...]] = []
     for k, method in enumerate(methods):
@@ -81,11 +84,6 @@ def _tier_table(scores: Scores, tier: str) -> Table:
         done = f"{len(scores.within(tier, method.key, 'scored'))} of {len(scores.suite.tier(tier))}"
         rows.append((method.name, *(column[k] for column in columns), Entry(done, note=note)))
     return Table(("method", *map(heading, names), "scored"), tuple(rows))
-
-
-def _by_sequence(scores: Scores) -> Chooser:
-    names = [n for n in FIGURES if any(s.value(n) is not None for s in scores.by_name.values())]
-    return Chooser("Figure", tuple((heading(n), (Sortable(_sequence_table(scores, n)),)) for n in names or FIGURES[:1]))
 
 
 def _sequence_table(scores: Scores, name: str) -> Table:
@@ -122,12 +120,12 @@ def _marked(name: str, values: Sequence[float | None]) -> list[Entry]:
 
 
 def _groups(scores: Scores) -> tuple[str, ...]:
-    """Names of the groups whose sequences differ in their readout."""
-    readouts: dict[str, set[float]] = {}
+    """Names of the groups whose sequences all differ in their readout."""
+    readouts: dict[str, list[float]] = {}
     for s in scores.sequences:
         if s.readout_ms is not None and s.entry.group:
-            readouts.setdefault(s.entry.group, set()).add(s.readout_ms)
-    return tuple(name for name, found in readouts.items() if len(found) > 1)
+            readouts.setdefault(s.entry.group, []).append(s.readout_ms)
+    return tuple(name for name, found in readouts.items() if len(set(found)) == len(found) > 1)
 
 
 def _by_readout(scores: Scores, group: str) -> PageImage | None:

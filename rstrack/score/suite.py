@@ -75,14 +75,14 @@ def read_suite(root: Path, only: tuple[str, ...] = ()) -> Suite:
         folders = sorted(p.name for p in root.iterdir() if any((p / name).is_file() for name in _SEQUENCE_FILES))
         if not folders:
             raise UserError(f"{root}: holds neither {SUITE} nor folders of sequences: give the folder above them")
-        found = _SuiteFile(name=root.resolve().name, entries=tuple(SuiteEntry(name=name) for name in folders))
+        found = _SuiteFile(entries=tuple(SuiteEntry(name=name) for name in folders))
     names = [entry.name for entry in found.entries]
     if len(set(names)) < len(names):
         raise UserError(f"{file}: '{next(name for name in names if names.count(name) > 1)}' is there twice")
     entries = tuple(e for e in found.entries if not only or _matches(e, only))
     if not entries:
         raise UserError(f"--only {' '.join(only)}: no sequence of {root} has such a name, tier, role or group")
-    return Suite(root, found.name, str(found.version), entries)
+    return Suite(root, found.name or root.resolve().name, str(found.version), entries)
 
 
 def _matches(entry: SuiteEntry, patterns: tuple[str, ...]) -> bool:
