@@ -26,6 +26,7 @@ PACKAGES = {
     "PIL": "pillow", "cv2": "opencv-python-headless", "skimage": "scikit-image", "yaml": "PyYAML", "rerun": "rerun-sdk",
     "bpy": "bpy", "mathutils": "bpy", "pxr": "usd-core", "liblzfse": "pyliblzfse", "dask": "distributed",
     "apsw": "rosbags", "lz4": "rosbags", "markupsafe": "jinja2", "ncore": "nvidia-ncore",
+    "Datasets": "VSLAM-LAB", "Baselines": "VSLAM-LAB",
 }  # fmt: skip
 
 
@@ -120,6 +121,7 @@ def test_all_that_is_imported_is_required_or_an_extra() -> None:
     known = {requirement(text) for text in (*PROJECT["dependencies"], *(part for e in extras.values() for part in e))}
     files = [path for folder in ("rsgen", "rstrack", "docs/examples") for path in (ROOT / folder).rglob("*.py")]
     used = {name for path in files for name in modules(path)}
+    known.add("vslam-lab")  # whose own modules are beside the examples for it
     assert {"rosbags", "pyrealsense2", "pxr"} < used
     assert not {name for name in used if PACKAGES.get(name, name).lower() not in known}
 

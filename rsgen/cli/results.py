@@ -152,7 +152,7 @@ def export(
     sequence: SequenceFolder,
     *,
     out: Annotated[Path | None, "where to (default: within the sequence's folder)", "PATH"] = None,
-    copy: Annotated[bool, "euroc, registered, kalibr, colmap, nerfstudio: copy images instead of linking them"] = False,
+    copy: Annotated[bool, "of exports that are folders: copy images instead of linking them"] = False,
     scene: Annotated[Path | None, "video: scene file, if it has moved since the sequence was rendered"] = None,
     storage: Annotated[Storage, "ros2: what the bag is stored in"] = "sqlite3",
     color: Annotated[str | None, "of a rig, where one colour camera is exported: its name (default: the first)"] = None,

@@ -139,7 +139,8 @@ def _add(to: Any, name: str, hint: Any, default: Any, kind: Any = inspect.Parame
     for alone in (word for word in more if isinstance(word, Alone)):
         how |= {"nargs": "?", "const": alone.value}
     if kind is not inspect.Parameter.KEYWORD_ONLY:
-        to.add_argument(name, **how, **({"nargs": "+"} if many else {} if required else {"nargs": "?"}))
+        nargs = {(True, True): "+", (True, False): "*", (False, False): "?"}.get((bool(many), required))
+        to.add_argument(name, **how, **({"nargs": nargs} if nargs else {}))
         return
     if many:
         how |= {"action": "append"} if many is list else {"action": "extend", "nargs": "+"}

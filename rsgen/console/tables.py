@@ -18,13 +18,17 @@ NOTHING = "-"
 
 @dataclass(frozen=True)
 class Entry:
-    """A table's entry. mark: follows the text. note: small print to it. is_worse: than what the note says."""
+    """A table's entry. mark: follows the text. note: small print to it. is_worse: than what the note says.
+
+    link: an address that the text leads to.
+    """
 
     text: str
     mark: str = ""
     note: str = ""
     is_best: bool = False
     is_worse: bool = False
+    link: str = ""
 
     def __str__(self) -> str:
         return self.text + self.mark

@@ -20,6 +20,7 @@ EXPORTS = {
     "colmap": ("colmap", "colmap", "text model and images"),
     "nerfstudio": ("nerfstudio", "nerfstudio", "transforms.json, poses and velocities for rolling-shutter splatting"),
     "ncore": ("ncore", "ncore", "NVIDIA's format, poses for every line"),
+    "vslamlab": ("vslamlab", "vslamlab", "a sequence's folder in VSLAM-LAB: rgb.csv, calibration.yaml"),
     "video": ("video", "shutter.mp4", "global beside rolling shutter (.mp4)"),
     "rerun": ("rerun", "{}.rrd", ".rrd recording"),
 }  # fmt: skip

@@ -66,6 +66,8 @@ FIGURES: tuple[FigureInfo, ...] = (
     FigureInfo("nees", "NEES/6", "", "nominal", "log", nominal=1.0),
     FigureInfo("nees_01", "NEES/6 over 0.1 s", "", "nominal", "log", nominal=1.0),
     FigureInfo("nees_5", "NEES/6 over 5 s", "", "nominal", "log", nominal=1.0),
+    FigureInfo("nees_first", "NEES/6 from the first pose", "", "nominal", "log", nominal=1.0),
+    FigureInfo("tracked_pct", "tracked", "%", "more", "linear"),
     FigureInfo("coverage_50", "within 50 %", "", "nominal", "linear", nominal=0.5),
     FigureInfo("coverage_90", "within 90 %", "", "nominal", "linear", nominal=0.9),
     FigureInfo("coverage_99", "within 99 %", "", "nominal", "linear", nominal=0.99),

@@ -12,6 +12,7 @@ from rsgen.console.command_line import Commands, Parser, Quiet, run_program
 from rstrack.cli.benchmark import BENCH_STATUS, bench
 from rstrack.cli.options import CameraFile, ImuFile, SequenceFolder
 from rstrack.cli.results import evaluate, export, map_, report
+from rstrack.cli.score import SCORE_STATUS, score
 from rstrack.cli.tracking import CALIBRATE_STATUS, TRACK_STATUS, calibrate, refine, track
 
 _DESCRIPTION = """\
@@ -28,6 +29,7 @@ rstrack estimates the continuous-time trajectory of a rolling-shutter RGB-D came
   rstrack evaluate out/demo mesh.ply                   its distance from the scene
   rstrack export runs/demo covariance --out demo.cov   for other tools: poses with their covariances, keyframes
   rstrack bench --quick                                every method on some sequences, beside the paper's figures
+  rstrack score suite results --out board              anybody's trajectories of a suite: errors, a leaderboard
 
 A sequence is a folder that 'rsgen render' wrote, or a TUM RGB-D, ICL-NUIM or 7-Scenes folder; the first two of those
 need their cameras in a camera.yaml, calibration.yaml or camchain.yaml inside, or in the file that --camera names.
@@ -72,6 +74,7 @@ def _parser() -> Parser:
     add(map_, "out/lr_kt2 runs/lr_kt2 --out lr_kt2.ply --every 5")
     add(export, "runs/lr_kt2 covariance --out lr_kt2.cov", "runs/table1 keyframes --out keyframes")
     add(bench, "--data out --out out/bench --sequence robot_t1 robot_r1 --method baseline rs-pg", note=BENCH_STATUS)
+    add(score, "suite results runs/demo --out board", "suite results --out board --only small", note=SCORE_STATUS)
     return commands.parser
 
 

@@ -91,6 +91,24 @@
     stack.addEventListener("pointermove", (event) => { if (event.buttons) follow(event); });
   }
 
+  // Up first, then down; cells that hold no number stay below those that do.
+  for (const table of document.querySelectorAll("table.sortable")) {
+    const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
+    const words = (row, k) => row.cells[k].textContent.trim();
+    heads.forEach((head, k) => head.querySelector("button").addEventListener("click", () => {
+      const sign = head.getAttribute("aria-sort") === "ascending" ? -1 : 1;
+      for (const other of heads) other.removeAttribute("aria-sort");
+      head.setAttribute("aria-sort", sign > 0 ? "ascending" : "descending");
+      const isText = head.classList.contains("words") || k === 0;
+      const order = (a, b) => {
+        if (isText) return sign * words(a, k).localeCompare(words(b, k));
+        const [x, y] = [a, b].map((row) => parseFloat(words(row, k)));
+        return isNaN(x) || isNaN(y) ? isNaN(x) - isNaN(y) : sign * (x - y);
+      };
+      body.append(...[...body.rows].sort(order));
+    }));
+  }
+
   // Where a browser keeps the clipboard from a page that was opened as a file, the text is marked for Ctrl-C.
   for (const file of document.querySelectorAll(".file")) {
     const text = file.querySelector("pre"), said = file.querySelector(".said");

@@ -108,7 +108,15 @@ class TextFile:
         return "data:text/plain;base64," + base64.b64encode(self.text.encode()).decode("ascii")
 
 
-Block = Table | Plot | ImageRow | Slider | Note | TextFile
+@dataclass(frozen=True)
+class Sortable:
+    """A table whose rows are put in order by a click on a heading; what is no number comes last."""
+
+    table: Table
+    block: Literal["sortable"] = "sortable"
+
+
+Block = Table | Sortable | Plot | ImageRow | Slider | Note | TextFile
 
 
 @dataclass(frozen=True)
@@ -143,7 +151,7 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """The page as HTML with everything in it: styles, scripts, plotly.js (once), figures and pictures."""
+    """The page as HTML with everything in it: styles, scripts, figures with plotly.js (once), and pictures."""
     from jinja2 import Environment, StrictUndefined  # imports of a tenth of a second, which only a report needs
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs  # type: ignore[import-untyped]
@@ -165,7 +173,7 @@ def render(page: Page) -> str:
         page=page,
         css=Markup((here / "page.css").read_text("utf-8")),
         script=Markup((here / "page.js").read_text("utf-8")),
-        plotly=Markup(get_plotlyjs()),
+        plotly=lambda: Markup(get_plotlyjs() if figures else ""),  # 4 MB
         figures=lambda: Markup(_json(figures)),
     )
 

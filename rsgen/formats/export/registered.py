@@ -6,21 +6,24 @@ lie beside each other their order hardly changes, and camera.yaml states whose r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.files import atomic_write, encode_yaml
-from rsgen.formats.export.shared import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
+from rsgen.formats.export.shared import (
+    DEFAULTS,
+    ExportOptions,
+    color_truth,
+    make_folders,
+    new_folder,
+    place_images,
+    registered_cameras,
+)
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
-from rsgen.sensors.reports import reported_poses
-from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
-from rsgen.sequence.format import associate, ground_truth, pose_lines
+from rsgen.sequence.format import associate, pose_lines
 from rsgen.sequence.images import Sequence
-from rsgen.truth.settings import sequence_mocap
 
 _MARK = "registered to the colour camera"
 
@@ -64,24 +67,10 @@ def export_registered(
     _write(out / "depth.txt", [f"# depth images of {sequence.name}, {_MARK}", "# stamp path", *entries["depth"]])
     pairs = associate(color.listed, depth.listed, 0.5 / min(color.rate_hz, depth.rate_hz))
     _write(out / "associations.txt", [f"{entries['rgb'][i]} {entries['depth'][j]}" for i, j in pairs])
-    title = f"ground truth of {sequence.name}: T_world_color"
-    T_color_depth = sequence.as_taken.T_color_depth
-    if (mocap := sequence_mocap(sequence)) is None:
-        rows = ground_truth(sequence.spline, color.stamps, depth.stamps, T_cam_body=T_color_depth)
-    else:
-        rows = reported_poses(sequence.spline, *mocap, T_color_depth)
-        title += ", as a motion capture reports it"
-    _write(out / "groundtruth.txt", pose_lines(title, rows))
-    atomic_write(out / "camera.yaml", f"# depth is {_MARK}\n".encode() + encode_yaml(_camera_yaml(sequence)))
+    rows, reported = color_truth(sequence)
+    _write(out / "groundtruth.txt", pose_lines(f"ground truth of {sequence.name}: T_world_color{reported}", rows))
+    atomic_write(out / "camera.yaml", f"# depth is {_MARK}\n".encode() + encode_yaml(registered_cameras(sequence)))
     return f"{out}: {len(depth.paths)} depth images {_MARK}; {100 * filled:.0f} % of pixels have depth"
-
-
-def _camera_yaml(sequence: Sequence) -> Mapping[str, Any]:
-    color, depth = sequence.streams["color"], sequence.streams["depth"]
-    sensors = color.camera, color.shutter, depth.camera, depth.shutter
-    driver = any((stream.listed != stream.stamps).any() for stream in (color, depth))
-    clock = ColorClock("auto", is_exact=False) if driver else ColorClock()
-    return camera_yaml(Cameras(*sensors, depth.depth_scale, sequence.T_color_depth), clock, is_registered=True)
 
 
 def _write(path: Path, lines: list[str]) -> None:

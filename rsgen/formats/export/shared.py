@@ -1,4 +1,4 @@
-"""What the exports share: options, a fresh folder or file, linked images, aligned depth, lens coefficients."""
+"""What the exports share: options, a fresh folder or file, linked images, aligned depth, colour's poses, lenses."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_bytes, write_error
@@ -19,7 +20,11 @@ from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
+from rsgen.sensors.reports import reported_poses
+from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
+from rsgen.sequence.format import ground_truth
 from rsgen.sequence.images import ImageStream, Rig, Sequence
+from rsgen.truth.settings import sequence_mocap
 
 Storage = Literal["sqlite3", "mcap"]
 EPOCH_S = 1_000_000_000
@@ -170,6 +175,24 @@ def aligned_depth(
     if not paired.all():
         atomic_write(folder / NO_DEPTH, encode_png(np.zeros((color.camera.height, color.camera.width), np.uint16)))
     return [depth.paths[i].name if found else NO_DEPTH for i, found in zip(nearest, paired, strict=True)]
+
+
+def registered_cameras(sequence: Sequence) -> dict[str, Any]:
+    """A camera.yaml of depth that was warped into the colour camera: from where, and whose rows' times it has."""
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    sensors = color.camera, color.shutter, depth.camera, depth.shutter
+    driver = any((stream.listed != stream.stamps).any() for stream in (color, depth))
+    clock = ColorClock("auto", is_exact=False) if driver else ColorClock()
+    return camera_yaml(Cameras(*sensors, depth.depth_scale, sequence.T_color_depth), clock, is_registered=True)
+
+
+def color_truth(sequence: Sequence) -> tuple[FloatArray, str]:
+    """Rows (n, 8) of the colour camera's true poses, or of those that a motion capture reports, and words for that."""
+    T_color_depth = sequence.as_taken.T_color_depth
+    if (mocap := sequence_mocap(sequence)) is not None:
+        return reported_poses(sequence.spline, *mocap, T_color_depth), ", as a motion capture reports it"
+    stamps = (sequence.streams[name].stamps for name in ("color", "depth"))
+    return ground_truth(sequence.spline, *stamps, T_cam_body=T_color_depth), ""
 
 
 def has_color_pixels(sequence: Sequence) -> bool:

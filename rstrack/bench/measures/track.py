@@ -79,19 +79,34 @@ def accuracy(task: Task, estimate: Estimate) -> Figures:
             return {"frames": frames, "lost": frames, "silent": 0}
     found = evaluation.chosen
     shift = evaluation.offset_s if evaluation.asked else None
-    return {
-        "frames": frames,
-        "lost": frames - found.frames_tracked,
+    return errors_of(found) | {
         "silent": silent(shifted(truth, shift or 0.0), estimate),
+        **consistency_of(found if case.truth_extrinsics is None else _mounted(truth, estimate, shift)),
+        "truth_offset_ms": None if offset is None else _scaled(evaluation.offset_s),
+    }
+
+
+def errors_of(found: Metrics) -> Figures:
+    """Frames and errors by the names of `rstrack.bench.figures`."""
+    return {
+        "frames": found.frames,
+        "lost": found.frames - found.frames_tracked,
         "ate_mm": 1e3 * found.ate_rmse_m,
         "ate_max_mm": 1e3 * found.ate_max_m,
         "drift_mm_s": _scaled(found.rpe_trans_rmse_m_per_s),
         "drift_deg_s": found.rpe_rot_rmse_deg_per_s,
         "line_mm": _scaled(found.row_rmse_m),
         "line_deg": found.row_rot_rmse_deg,
-        **_consistency(found if case.truth_extrinsics is None else _mounted(truth, estimate, shift)),
-        "truth_offset_ms": None if offset is None else _scaled(evaluation.offset_s),
     }
+
+
+def consistency_of(metrics: Metrics | None) -> Figures:
+    """NEES/6 over 0.1, 1 and 5 s, and shares within the regions over 1 s; None where there are no covariances."""
+    horizons = {} if metrics is None else {horizon.seconds: horizon for horizon in metrics.consistency}
+    named = {"nees_01": 0.1, "nees": 1.0, "nees_5": 5.0}
+    nees = {name: horizons[seconds].nees if seconds in horizons else None for name, seconds in named.items()}
+    within = horizons[1.0].within if 1.0 in horizons else {}
+    return nees | {f"coverage_{level}": within.get(level) for level in LEVELS}
 
 
 def silent(truth: Truth, estimate: Estimate) -> int:
@@ -175,14 +190,6 @@ def _mounted(truth: Truth, estimate: Estimate, offset_s: float | None) -> Metric
         return evaluate_extrinsics(truth, estimate, offset_s).chosen
     except UserError:
         return None
-
-
-def _consistency(metrics: Metrics | None) -> Figures:
-    horizons = {} if metrics is None else {horizon.seconds: horizon for horizon in metrics.consistency}
-    named = {"nees_01": 0.1, "nees": 1.0, "nees_5": 5.0}
-    nees = {name: horizons[seconds].nees if seconds in horizons else None for name, seconds in named.items()}
-    within = horizons[1.0].within if 1.0 in horizons else {}
-    return nees | {f"coverage_{level}": within.get(level) for level in LEVELS}
 
 
 def _scaled(value: float | None) -> float | None:

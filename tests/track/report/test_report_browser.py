@@ -21,7 +21,9 @@ from report_util import (
     write_calibration,
 )
 
-from rstrack.report.build import write_report
+from rsgen.console.tables import Table
+from rstrack.report.build import write_page, write_report
+from rstrack.report.page import Page, PageSection, Sortable
 
 FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -265,3 +267,23 @@ def test_the_calibrations_page_fits_any_width_and_gives_its_camera_file(
         assert tab.evaluate("navigator.clipboard.readText()") == data["camera_file"]
     else:
         assert tab.evaluate("getSelection().toString()").strip() == data["camera_file"].strip()
+
+
+def test_a_click_on_a_heading_sorts_and_what_is_no_number_stays_last(tab: Any, tmp_path: Path) -> None:
+    rows = (("b", "10.5", "10 of 10"), ("c", "missing", "9 of 10"), ("a", "9.25", "10 of 10"), ("d", "-0.5", "-"))
+    table = Sortable(Table(("method", "ATE, mm", "scored"), rows))
+    page = Page("Board", "", (), (PageSection("one", "One", (table,)),))
+    tab.goto(write_page(page, tmp_path / "board.html").as_uri())
+    heads = tab.locator("table.sortable thead button")
+
+    def order() -> str:
+        return "".join(text.strip() for text in tab.locator("tbody th").all_text_contents())
+
+    assert order() == "bcad"
+    heads.nth(1).click()
+    assert order() == "dabc" and tab.locator("th[aria-sort='ascending']").text_content().startswith("ATE")
+    heads.nth(1).focus()
+    tab.keyboard.press("Enter")
+    assert order() == "badc" and tab.locator("th[aria-sort='descending']").count() == 1
+    heads.nth(0).click()
+    assert order() == "abcd" and tab.locator("th[aria-sort]").count() == 1

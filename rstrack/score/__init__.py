@@ -1,0 +1,1 @@
+"""Anybody's trajectories of a suite of sequences against the truth: `rstrack score`."""

@@ -1,0 +1,90 @@
+"""The sequences that trajectories are scored on: a folder of them, with or without a suite.yaml.
+
+suite = read_suite(Path("suite"), only=("small",))
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rsgen.errors import UserError, first_problem
+from rsgen.files import read_yaml
+
+SUITE = "suite.yaml"
+# Any of them makes a folder a sequence.
+_SEQUENCE_FILES = ("sequence.yaml", "associations.txt", "rgb.txt", "depth.txt")
+
+
+class SuiteEntry(BaseModel):
+    """A sequence: its folder's name, and what it is counted among. group: of sequences that differ in one thing."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")
+    tier: str = "all"
+    role: str = ""
+    group: str = ""
+
+
+class _SuiteFile(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    name: str = ""
+    version: str | float = ""
+    entries: tuple[SuiteEntry, ...] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Suite:
+    """root: the folder that holds a folder of each entry's name."""
+
+    root: Path
+    name: str
+    version: str
+    entries: tuple[SuiteEntry, ...]
+
+    @property
+    def tiers(self) -> tuple[str, ...]:
+        """Their names, in the order of the entries."""
+        return tuple(dict.fromkeys(entry.tier for entry in self.entries))
+
+    def tier(self, name: str) -> tuple[SuiteEntry, ...]:
+        """The entries of a tier."""
+        return tuple(entry for entry in self.entries if entry.tier == name)
+
+
+def read_suite(root: Path, only: tuple[str, ...] = ()) -> Suite:
+    """The entries of suite.yaml in a folder, without one all folders in it that look like sequences.
+
+    only: patterns (* and ?), of which the name, tier, role or group of an entry has to match one. Raises UserError, one
+    line: no such folder, nothing in it, an entry is wrong or there twice, nothing matches.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder: give one that holds folders of sequences")
+    if (file := root / SUITE).is_file():
+        try:
+            found = _SuiteFile.model_validate(read_yaml(file))
+        except ValidationError as error:
+            raise UserError(f"{file}: {first_problem(error)}") from None
+    else:
+        folders = sorted(p.name for p in root.iterdir() if any((p / name).is_file() for name in _SEQUENCE_FILES))
+        if not folders:
+            raise UserError(f"{root}: holds neither {SUITE} nor folders of sequences: give the folder above them")
+        found = _SuiteFile(entries=tuple(SuiteEntry(name=name) for name in folders))
+    names = [entry.name for entry in found.entries]
+    if len(set(names)) < len(names):
+        raise UserError(f"{file}: '{next(name for name in names if names.count(name) > 1)}' is there twice")
+    entries = tuple(e for e in found.entries if not only or _matches(e, only))
+    if not entries:
+        raise UserError(f"--only {' '.join(only)}: no sequence of {root} has such a name, tier, role or group")
+    return Suite(root, found.name or root.resolve().name, str(found.version), entries)
+
+
+def _matches(entry: SuiteEntry, patterns: tuple[str, ...]) -> bool:
+    words = (entry.name, entry.tier, entry.role, entry.group)
+    return any(fnmatchcase(word, pattern) for word in words for pattern in patterns)
