@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Set-up and the two commands of this project: ./run.sh demo, ./run.sh test (and ./run.sh setup alone, and for who
-# changes it ./run.sh bench smoke|gate|full).
+# changes it ./run.sh bench smoke|gate|full and ./run.sh next).
 # Installs into .venv, and a libLLVM (16 or newer) from the system's packages if there is none. A second run is quick.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
@@ -92,6 +92,21 @@ test_all() {
   return "$status"
 }
 
+# The tests with the newest Mitsuba, where pyproject.toml does not allow it yet: in a copy, so that .venv stays as it is.
+next_mitsuba() {
+  local bound newest copy
+  bound=$(sed -n 's/.*"mitsuba>=[0-9.]*,<\([0-9.]*\)".*/\1/p' pyproject.toml)
+  newest=$(.venv/bin/python -m pip index versions --pre mitsuba | sed -n 's/^Available versions: \([^,]*\).*/\1/p')
+  if [ "$(printf '%s\n' "$bound" "$newest" | sort -V | head -n 1)" != "$bound" ]; then
+    say "no Mitsuba from $bound on yet: the newest is $newest"
+    return 0
+  fi
+  copy=$(mktemp -d)
+  git clone --quiet . "$copy"
+  say "the tests with Mitsuba $newest, in $copy"
+  (cd "$copy" && ./run.sh setup && .venv/bin/python -m pip install --quiet "mitsuba==$newest" && ./run.sh test "$@")
+}
+
 bench() {
   OPENBLAS_NUM_THREADS=1 .venv/bin/python -m benchmarks "$@"
 }
@@ -101,5 +116,6 @@ case "${1:-}" in
   demo) setup; demo ;;
   test) shift; setup; test_all "$@" ;;
   bench) shift; setup; bench "$@" ;;
-  *) die "usage: ./run.sh demo | test [pytest arguments] | bench TIER | setup" ;;
+  next) shift; setup; next_mitsuba "$@" ;;
+  *) die "usage: ./run.sh demo | test [pytest arguments] | bench TIER | next [pytest arguments] | setup" ;;
 esac

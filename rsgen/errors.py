@@ -1,8 +1,10 @@
-"""The one exception that means "the input is wrong": its message is one line: what, where, and what to do."""
+"""The one exception that means "the input is wrong", and its words, one line: what, where, what to do."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from importlib.metadata import requires
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -16,6 +18,20 @@ class UserError(Exception):
 def first_few(names: Sequence[str], most: int = 3) -> str:
     """'a, b, c and 2 more': at most so many of the names."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def how_to_install(*extras: str, package: str = "") -> str:
+    """'pip install' with the packages of these extras, or with one of them, and their bounds, as the metadata has them.
+
+    They are named themselves, which works wherever the project was installed from. Raises ValueError: no such extra or
+    package; PackageNotFoundError: the project is not installed.
+    """
+    named = [part.partition(";") for part in requires("rolling-shutter-rgbd") or ()]
+    wanted = [part for part, _, marker in named if any(f"extra == '{extra}'" in marker for extra in extras)]
+    found = [part for part in wanted if package in ("", re.split(r"[^\w.-]", part)[0])]
+    if not found:
+        raise ValueError(f"no package '{package}' in the extras {', '.join(extras)}")
+    return "pip install " + " ".join(f"'{part}'" for part in found)
 
 
 def first_problem(error: ValidationError, *within: str) -> str:

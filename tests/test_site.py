@@ -33,8 +33,15 @@ def pages(nav: Any) -> list[str]:
 
 
 def test_every_document_is_in_the_navigation_once() -> None:
-    found = sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
-    assert sorted(pages(CONFIG["nav"])) == sorted([*found, "index.md"])
+    found = [path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md") if path.parent != SITE]
+    assert sorted(pages(CONFIG["nav"])) == sorted([*found, "index.md", "guide.md"])
+
+
+def test_the_front_page_shows_what_the_readme_says_of_the_records() -> None:
+    page, readme = hooks.front_page(), (ROOT / "README.md").read_text()
+    rows = [line for line in readme.splitlines() if line.startswith("| `") or line.startswith("| method |")]
+    assert len(rows) > 10 and all(row in page for row in rows)
+    assert "On real recordings" in page and "{{" not in page and "](docs/" not in page
 
 
 def test_every_module_is_in_the_reference_once() -> None:
@@ -58,10 +65,10 @@ def test_every_module_is_in_the_reference_once() -> None:
 @pytest.mark.parametrize(
     ("page", "text", "led"),
     [
-        ("index.md", "[a](docs/format.md#a-config)", "[a](format.md#a-config)"),
-        ("index.md", "![a](docs/compare.jpg)", "![a](compare.jpg)"),
-        ("index.md", "[b](docs/examples/README.md) [c](#more)", "[b](examples/README.md) [c](#more)"),
-        ("format.md", "[a](../README.md#track-it)", "[a](index.md#track-it)"),
+        ("guide.md", "[a](docs/format.md#a-config)", "[a](format.md#a-config)"),
+        ("guide.md", "![a](docs/compare.jpg)", "![a](compare.jpg)"),
+        ("guide.md", "[b](docs/examples/README.md) [c](#more)", "[b](examples/README.md) [c](#more)"),
+        ("format.md", "[a](../README.md#track-it)", "[a](guide.md#track-it)"),
         ("method.md", "[`p`](../pyproject.toml) [x](https://example.org/a)", "`p` [x](https://example.org/a)"),
         ("examples/README.md", "[a](../format.md) [b](own.ipynb)", "[a](../format.md) [b](own.ipynb)"),
     ],

@@ -1,12 +1,17 @@
-"""The wheel carries all that the demo needs, and its configs are found by name wherever it is installed."""
+"""The wheel carries all that the demo needs, can be built again byte for byte, and finds its configs by name.
+
+What messages and documents say of installing is so.
+"""
 
 from __future__ import annotations
 
 import ast
+import hashlib
 import os
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from importlib.metadata import PathDistribution
@@ -18,6 +23,7 @@ import yaml
 
 from rsgen.config.config import load_config
 from rsgen.console.configs import config_file, configs_folder
+from rsgen.errors import how_to_install
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -30,18 +36,30 @@ PACKAGES = {
 }  # fmt: skip
 
 
+def build(source: Path, out: Path) -> tuple[Path, Path]:
+    """The sdist and the wheel of a source tree, as docs/releasing.md builds them."""
+    command = [sys.executable, "-m", "hatchling", "build", "-d", str(out), "-t", "sdist", "-t", "wheel"]
+    environment = os.environ | {"SOURCE_DATE_EPOCH": "1700000000"}
+    done = subprocess.run(command, cwd=source, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return next(out.glob("*.tar.gz")), next(out.glob("*.whl"))
+
+
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel's files, unpacked as pip does, in folders that nobody should write into."""
+def dist(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The sdist and the wheel of this checkout."""
     if find_spec("hatchling") is None:
         pytest.skip("hatchling, which builds the wheel, is not installed")
-    out = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", out, ROOT]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    with zipfile.ZipFile(next(out.glob("*.whl"))) as wheel:
-        wheel.extractall(out / "site")
-    return out / "site"
+    return build(ROOT, tmp_path_factory.mktemp("dist"))
+
+
+@pytest.fixture(scope="module")
+def site(dist: tuple[Path, Path]) -> Path:
+    """The wheel's files, unpacked as pip does, in folders that nobody should write into."""
+    out = dist[1].parent / "site"
+    with zipfile.ZipFile(dist[1]) as wheel:
+        wheel.extractall(out)
+    return out
 
 
 def run(site: Path, place: Path, *words: str) -> str:
@@ -63,6 +81,21 @@ def test_the_wheel_has_all_configs_and_scripts_and_nothing_built(site: Path) -> 
     assert not [path for path in site.rglob("*") if path.suffix in (".xml", ".ply", ".npz")]
     assert (site / "rstrack/report/page.html").is_file()
     assert (site / "rsgen/py.typed").is_file() and (site / "rstrack/py.typed").is_file()
+
+
+def test_a_build_elsewhere_has_the_same_bytes(dist: tuple[Path, Path], tmp_path: Path) -> None:
+    """Of the unpacked sdist, whose files are in another place, younger and their owner's alone."""
+    with tarfile.open(dist[0]) as archive:
+        archive.extractall(tmp_path, filter="data")
+    source = next(tmp_path.iterdir())
+    (source / "PKG-INFO").unlink()  # written into an sdist; one that is there would be packed beside the new one
+    for path in source.rglob("*"):
+        path.chmod(path.stat().st_mode & 0o700)
+        os.utime(path)
+    again = build(source, tmp_path)
+    assert [hashlib.sha256(path.read_bytes()).hexdigest() for path in again] == [
+        hashlib.sha256(path.read_bytes()).hexdigest() for path in dist
+    ]
 
 
 def test_configs_of_the_wheel_are_found_by_name_and_kept_in_the_users_cache(site: Path, tmp_path: Path) -> None:
@@ -131,12 +164,31 @@ def test_the_wheel_offers_the_extras_that_are_named(site: Path) -> None:
     extras = set(found.get_all("Provides-Extra") or ())
     assert extras == set(PROJECT["optional-dependencies"])
     texts = [
+        ROOT / "README.md",
         *(ROOT / "docs").rglob("*.md"),
         *(p for f in ("rsgen", "rstrack", "docs") for p in (ROOT / f).rglob("*.py")),
     ]
-    named = {x for p in texts for group in re.findall(r"rgbd\[([\w,]+)\]", p.read_text()) for x in group.split(",")}
+    told = "\n".join(path.read_text() for path in texts if path.name != "releasing.md")
+    named = {name for group in re.findall(r"'\.\[([\w,]+)\]'", told) for name in group.split(",")}
     assert len(named) > 5 and named <= extras
+    assert "install rolling-shutter-rgbd" not in told and "rgbd[" not in told  # no registry has it
     assert found["Version"] == PROJECT["version"]
+
+
+def test_messages_name_the_packages_of_the_extras() -> None:
+    assert how_to_install("ros") == "pip install 'rosbags<0.12,>=0.11.9'"
+    assert how_to_install("peers", package="small-gicp") == "pip install 'small-gicp<2,>=1'"
+    both = how_to_install("peers", "orbslam3")
+    assert "pyorbslam3" in both and "open3d" in both and "rosbags" not in both
+    with pytest.raises(ValueError, match="no package 'rosbags' in the extras peers"):
+        how_to_install("peers", package="rosbags")
+    code = "\n".join(path.read_text() for folder in ("rsgen", "rstrack") for path in (ROOT / folder).rglob("*.py"))
+    calls = re.findall(r"""how_to_install\((['"]\w+['"][^)]*)\)""", code)
+    assert len(calls) > 10
+    for call in calls:
+        names = re.findall(r"""(?<!=)['"]([\w-]+)['"]""", call)
+        package = re.search(r"package=['\"]([\w-]+)", call)
+        assert how_to_install(*names, package=package[1] if package else "").startswith("pip install '")
 
 
 def test_what_is_to_be_cited_is_this_version() -> None:

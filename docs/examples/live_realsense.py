@@ -4,7 +4,7 @@
     python docs/examples/live_realsense.py recorded.db3          # the same loop over a file (.bag of older versions)
     python docs/examples/live_realsense.py --color-readout-s 0.017 --color-offset-s -0.004
 
-Needs librealsense (pip install 'rolling-shutter-rgbd[realsense]'; Debian: also libusb-1.0-0). Readout and offset are
+Needs librealsense (pip install '.[realsense]'; Debian: also libusb-1.0-0). Readout and offset are
 nowhere to be read: record ten seconds, then `rstrack import` and `rstrack calibrate` find them (docs/recordings.md).
 """
 

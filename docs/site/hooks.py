@@ -1,6 +1,6 @@
-"""What MkDocs is told beside mkdocs.yml: the README as the front page, a page of reference for every wing.
+"""What MkDocs is told beside mkdocs.yml: the front page, the README as the guide, a page of reference for every wing.
 
-Links that leave docs/ lead to the front page or, to files of the repository, become their names.
+Links to the README lead to the guide; those to other files of the repository become their names.
 """
 
 from __future__ import annotations
@@ -62,6 +62,16 @@ def face(package: str) -> str:
     return f"# {package}\n\n{summary}\n\n" + "\n\n".join(f"::: {name}" for name in homes.values()) + "\n"
 
 
+def front_page() -> str:
+    """landing.md with what the README shows of the records: its headline, its table and the line that explains it."""
+    readme = _LINK.sub(lambda match: _led(match, ROOT, ROOT / "docs"), (ROOT / "README.md").read_text())
+    blocks = dict(re.findall(r"<!-- (headline|results):begin.*?-->\n(.*?)<!-- \1:end -->", readme, flags=re.S))
+    shown = [line for line in blocks["results"].splitlines() if line.startswith(("|", "Cells"))]
+    blocks["results"] = "\n".join(shown).replace("\n|", "\n\n|", 1)
+    text = (ROOT / "docs/site/landing.md").read_text()
+    return re.sub(r"{{(\w+)}}", lambda match: blocks[match[1]].strip(), text)
+
+
 def on_config(config: Any) -> Any:
     """The reference's place in the navigation, and anchors as GitHub has them."""
     entries = [
@@ -76,10 +86,10 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """The front page and the reference, which lie in no folder."""
+    """The front page, the guide and the reference, which lie in no folder."""
     from mkdocs.structure.files import File  # here, so that the rest is tested without MkDocs
 
-    pages = {"index.md": (ROOT / "README.md").read_text()}
+    pages = {"index.md": front_page(), "guide.md": (ROOT / "README.md").read_text()}
     for package in PACKAGES:
         pages[f"reference/{package}/index.md"] = face(package)
         pages |= {f"reference/{package}/{wing}.md": reference(package, wing) for wing in wings(package)}
@@ -89,11 +99,11 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Links of the README begin in the repository's root, those of the documents in docs/; examples are shown."""
+    """Links of the guide begin in the repository's root, those of the documents in docs/; examples are shown."""
     source = page.file.src_uri
-    if source.startswith("reference/"):
+    if source.startswith("reference/") or source == "index.md":
         return markdown
-    here = ROOT if source == "index.md" else (ROOT / "docs" / source).parent
+    here = ROOT if source == "guide.md" else (ROOT / "docs" / source).parent
     if source == "examples/README.md":
         scripts = sorted((ROOT / "docs/examples").glob("*.py"))
         markdown += "".join(f"\n## {path.name}\n\n```python\n{path.read_text()}```\n" for path in scripts)
@@ -106,7 +116,7 @@ def _led(match: re.Match[str], here: Path, page: Path) -> str:
         return match[0]
     path = (here / target).resolve()
     if path == ROOT / "README.md":
-        path = ROOT / "docs/index.md"
+        path = ROOT / "docs/guide.md"
     elif not path.is_relative_to(ROOT / "docs"):
         return text
     return f"{mark}[{text}]({Path(os.path.relpath(path, page)).as_posix()}{anchor})"

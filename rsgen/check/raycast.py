@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.geometry import se3
 from rsgen.sequence.images import COLOR_DEPTH, ImageStream, Rig
 
@@ -51,7 +51,7 @@ def _caster(path: Path) -> Any:
     try:
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError:
-        raise UserError("ray casting needs embreex: pip install 'rolling-shutter-rgbd[raycast]'") from None
+        raise UserError(f"ray casting needs embreex: {how_to_install('raycast')}") from None
     try:
         return RayMeshIntersector(trimesh.load(path, process=False, force="mesh"))
     except Exception as error:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.files import whole_file
 
 
@@ -17,7 +17,7 @@ def rerun(option: str) -> Any:
     try:
         return importlib.import_module("rerun")
     except ImportError:
-        raise UserError(f"{option}: rerun is not installed: pip install 'rolling-shutter-rgbd[rerun]'") from None
+        raise UserError(f"{option}: rerun is not installed: {how_to_install('rerun')}") from None
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 from uuid import uuid4
 
 from rsgen.console.progress import Progress
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -141,7 +141,7 @@ def open_workers(where: str | None) -> Iterator[Workers]:
     try:
         import distributed  # noqa: F401 - here to say so in one line
     except ImportError:
-        raise UserError("--scheduler needs Dask: pip install 'distributed>=2024.8'") from None
+        raise UserError(f"--scheduler needs Dask: {how_to_install('cluster')}") from None
     _let_dask_log(logging.WARNING)
     with _connected(where) if local is None else _started(int(local[1] or _cores())) as client:
         try:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png
 from rstrack.formats.pixels import compressed_color, header_size, units_of_metres
@@ -87,7 +87,7 @@ def _lzfse(path: Path) -> Unpack:
     try:
         import liblzfse
     except ImportError:
-        hint = "pip install 'rolling-shutter-rgbd[record3d]'"
+        hint = how_to_install("record3d")
         raise UserError(f"{path}: depth of Record3D is packed with LZFSE: {hint}") from None
     unpack: Unpack = liblzfse.decompress
     return unpack

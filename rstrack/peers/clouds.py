@@ -18,7 +18,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.geometry import se3
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
@@ -49,8 +49,8 @@ class KissIcp:
     """
 
     def __init__(self, max_depth: float) -> None:
-        module = _module("kiss_icp.kiss_icp", "kiss-icp>=1.2,<2")
-        config = _module("kiss_icp.config", "kiss-icp>=1.2,<2").load_config(None)
+        module = _module("kiss_icp.kiss_icp", "kiss-icp")
+        config = _module("kiss_icp.config", "kiss-icp").load_config(None)
         self.settings = {"voxel_size": 0.1, "initial_threshold": 0.3, "min_motion_th": 0.02}
         config.data.max_range, config.data.min_range, config.data.deskew = max_depth, _NEAREST_M, True
         config.mapping.voxel_size = self.settings["voxel_size"]
@@ -69,7 +69,7 @@ class SmallGicp:
     """small_gicp (Koide, JOSS 2024): generalised ICP against a keyframe, from a motion that goes on as it was."""
 
     def __init__(self, options: Options) -> None:
-        self._gicp = _module("small_gicp", "small_gicp>=1,<2")
+        self._gicp = _module("small_gicp", "small-gicp")
         self.settings = {"downsampling_resolution": 0.05, "max_correspondence_distance": 0.2, "max_iterations": 30}
         self._options = options
         self._key: tuple[Any, Any] | None = None
@@ -164,7 +164,7 @@ def _module(name: str, package: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise UserError(f"the peer needs {package.partition('>')[0]} ({error}): pip install '{package}'") from None
+        raise UserError(f"the peer needs {package} ({error}): {how_to_install('peers', package=package)}") from None
 
 
 def _last_line(dataset: Dataset) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rstrack.data.dataset import Dataset, registered_image
@@ -175,7 +175,7 @@ def open3d() -> Any:
     try:
         import open3d as module
     except ModuleNotFoundError as error:
-        raise UserError(f"the peers need Open3D ({error}): pip install 'open3d>=0.19,<1'") from None
+        raise UserError(f"the peers need Open3D ({error}): {how_to_install('peers', package='open3d')}") from None
     except (ImportError, OSError) as error:
         needed = "libusb-1.0-0 libgl1 libegl1 libx11-6 libidn2-0 libgomp1"
         first = str(error).splitlines()[0]

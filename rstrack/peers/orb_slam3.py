@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import ByteArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.files import atomic_write
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -62,7 +62,7 @@ def run_orb_slam3(
     """
     chosen = chosen_frames(dataset, frames)
     if find_spec("pyorbslam3") is None:
-        raise UserError("the peer needs pyorbslam3 (GPL): pip install 'pyorbslam3>=0.1.1,<0.2'")
+        raise UserError(f"the peer needs pyorbslam3 (GPL): {how_to_install('orbslam3')}")
     registrar = Registrar(dataset.rig)
     begin = time.perf_counter()
     with TemporaryDirectory(prefix="rstrack-orb-") as name:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.files import write_error
 from rsgen.formats.export.shared import ExportOptions, new_file
 from rsgen.geometry.camera import Camera
@@ -147,4 +147,4 @@ def _rosbags() -> tuple[Any, Any, Any]:
     try:
         return tuple(importlib.import_module(f"rosbags.{name}") for name in ("typesys", "rosbag1", "rosbag2"))  # type: ignore[return-value]
     except ImportError:
-        raise UserError("rosbags is not installed: pip install rosbags") from None
+        raise UserError(f"rosbags is not installed: {how_to_install('ros')}") from None

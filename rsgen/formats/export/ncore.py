@@ -18,14 +18,13 @@ import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.files import read_bytes, write_error
 from rsgen.formats.export import poses
 from rsgen.formats.export.shared import DEFAULTS, EPOCH_S, ExportOptions, counted, image_streams, new_folder
 from rsgen.geometry import se3
 from rsgen.sequence.images import ImageStream, Rig, Sequence
 
-INSTALL = "pip install 'rolling-shutter-rgbd[ncore]'"
 ENDS, DENSE = "start and end pose of an image", "the pose of each line"
 _STEP_US = 500  # a hand turns by nothing that is not straight meanwhile: 0.001 px
 Times = npt.NDArray[np.uint64]
@@ -88,7 +87,7 @@ def _library() -> tuple[Any, Any]:
     try:
         return importlib.import_module("ncore.data.v4"), importlib.import_module("ncore.data")
     except ImportError:
-        raise UserError(f"writing NCore needs nvidia-ncore: {INSTALL}") from None
+        raise UserError(f"writing NCore needs nvidia-ncore: {how_to_install('ncore')}") from None
 
 
 def _with_exact_row(T: FloatArray) -> FloatArray:

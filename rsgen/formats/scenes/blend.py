@@ -33,9 +33,7 @@ def read_content(path: Path, scale: float | None, up: Any) -> Content:
 
     Raises UserError if Blender is missing or cannot read the file, or if nothing in it can be rendered.
     """
-    check_installed(
-        "bpy", ".blend files need Blender's Python module bpy", "rolling-shutter-rgbd[blender]", " (Python 3.11)"
-    )
+    check_installed("bpy", ".blend files need Blender's Python module bpy", "blender", " (Python 3.11)")
     with tempfile.TemporaryDirectory(prefix="rsgen-blend-") as scratch:
         folder = Path(scratch)
         _run(path, folder)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError, first_few
+from rsgen.errors import UserError, first_few, how_to_install
 from rsgen.formats.meshes.parts import Part
 
 MOST_TRIANGLES = 30_000_000
@@ -47,9 +47,9 @@ class Content:
 
 
 def check_installed(module: str, need: str, extra: str, note: str = "") -> None:
-    """Raises UserError, beginning with the need, if there is no such module: what to install, and a note on that."""
+    """Raises UserError, beginning with the need, if there is no such module: the extra's packages, and a note."""
     if find_spec(module) is None:
-        raise UserError(f"{need}, which is not installed: install it with: pip install '{extra}'{note}")
+        raise UserError(f"{need}, which is not installed: install it with: {how_to_install(extra)}{note}")
 
 
 class Notes:

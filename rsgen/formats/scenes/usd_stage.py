@@ -31,7 +31,7 @@ def read_content(path: Path, scale: float | None, up: str | None) -> Content:
 
     Raises UserError for a file that is no USD, is damaged or holds no surface.
     """
-    check_installed("pxr", "USD files need the package usd-core", "rolling-shutter-rgbd[usd]")
+    check_installed("pxr", "USD files need the package usd-core", "usd")
     from pxr import Tf, Usd, UsdGeom, UsdUtils
 
     if not _is_mapped(path):

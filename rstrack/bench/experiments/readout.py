@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, first_problem, how_to_install
 from rsgen.files import read_yaml
 from rstrack.bench.cells import Benchmark, Cell
 from rstrack.bench.definitions import OTHERS, CaseEntry, Name, NoiseEntry, SequenceEntry, StrictModel, validated
@@ -108,7 +108,7 @@ def installed(methods: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
     """The methods that can run here, and those whose packages are not installed. Raises UserError: none can."""
     lacking = tuple(name for name in methods if name not in METHODS and find_spec(package_of(name)) is None)
     if len(lacking) == len(methods):
-        raise UserError(f"the sweep: none of {', '.join(lacking)} is installed: pip install '.[peers]'")
+        raise UserError(f"the sweep: none of {', '.join(lacking)} is installed: {how_to_install('peers', 'orbslam3')}")
     return tuple(name for name in methods if name not in lacking), lacking
 
 

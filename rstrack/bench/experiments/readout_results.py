@@ -12,6 +12,7 @@ import numpy as np
 
 from rsgen.console.progress import Progress
 from rsgen.console.tables import NOTHING, Entry, Table, fixed, significant
+from rsgen.errors import how_to_install
 from rstrack.bench.cells import Benchmark
 from rstrack.bench.experiments.readout import SweepConfig, installed, sweep_benchmark
 from rstrack.bench.experiments.run import Written
@@ -145,7 +146,7 @@ def sweep_notes(sweep: Sweep) -> list[str]:
         lines.append(f"† lost or failed (poses for fewer than half of the frames): {', '.join(some)}")
     lines += failures(sweep.records)
     if sweep.lacking:
-        lines.append(f"left out, not installed: {', '.join(sweep.lacking)} (pip install '.[peers]')")
+        lines.append(f"left out, not installed: {', '.join(sweep.lacking)} ({how_to_install('peers', 'orbslam3')})")
     if sweep.interrupted:
         lines.append("not run yet (-): the same command goes on where this one ended")
     return [*lines, provenance(sweep.records)]

@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.files import read_yaml
 from rsgen.inputs import check_input
 
@@ -26,7 +26,6 @@ _MCAP_START = b"\x89MCAP0\r\n"
 _SQLITE_START = b"SQLite format 3\0"
 # Of old bags: the same bytes under another name.
 _ALIASES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-INSTALL = "pip install 'rolling-shutter-rgbd[ros]'"
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ def open_bag(path: Path) -> Iterator[BagReader]:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError:
-        raise UserError(f"{path}: reading bags needs rosbags: {INSTALL}") from None
+        raise UserError(f"{path}: reading bags needs rosbags: {how_to_install('ros')}") from None
     is_ros1 = path.is_file() and _starts(path, _ROS1_START)
     if path.is_file() and not is_ros1:
         ending = ".mcap" if _starts(path, _MCAP_START) else ".db3"

@@ -294,6 +294,6 @@ def test_without_rosbags_and_before_time_0(sequence: Sequence, tmp_path: Path, m
         raise ImportError(name)
 
     monkeypatch.setattr(bag.importlib, "import_module", absent)
-    with pytest.raises(UserError, match="pip install rosbags"):
+    with pytest.raises(UserError, match="pip install 'rosbags"):
         export_ros(sequence, tmp_path / "a.bag", ExportOptions("ros1"))
     assert not list(tmp_path.iterdir())
