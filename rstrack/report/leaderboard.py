@@ -120,17 +120,24 @@ def _marked(name: str, values: Sequence[float | None]) -> list[Entry]:
 
 
 def _groups(scores: Scores) -> tuple[str, ...]:
-    """Names of the groups whose sequences all differ in their readout."""
+    """Names of the ladders whose sequences all differ in their readout."""
     readouts: dict[str, list[float]] = {}
     for s in scores.sequences:
         if s.readout_ms is not None and s.entry.group:
-            readouts.setdefault(s.entry.group, []).append(s.readout_ms)
+            readouts.setdefault(_ladder(s.entry), []).append(s.readout_ms)
     return tuple(name for name, found in readouts.items() if len(set(found)) == len(found) > 1)
+
+
+def _ladder(entry: SuiteEntry) -> str:
+    """The group, which may have a ladder in each of several rooms: names then end in their value, ROOM_14ms."""
+    return " ".join(word for word in (entry.group, entry.name.rpartition("_")[0]) if word)
 
 
 def _by_readout(scores: Scores, group: str) -> PageImage | None:
     """Errors over the readout of a group's sequences; None where no method has any."""
-    ladder = sorted((s for s in scores.sequences if s.entry.group == group and s.readout_ms is not None), key=_readout)
+    ladder = sorted(
+        (s for s in scores.sequences if _ladder(s.entry) == group and s.readout_ms is not None), key=_readout
+    )
     keys, x = [method.key for method in scores.methods], numbers([s.readout_ms for s in ladder])
     colors = method_colors(keys)
     # There are fewer colours than methods may be.
