@@ -37,8 +37,7 @@ _HEAD = """\
 
 What `rsgen` renders: each picture is one frame, and below it stands the command that renders it. Written by
 `python -m benchmarks.gallery` from `benchmarks/gallery.yaml`: change nothing here. The first frame of a room takes some
-minutes, since its light is baked then and kept; `light.mode path` traces it anew for each frame. Without `--frames` the
-whole sequence is rendered.
+minutes, since its light is baked then and kept. Without `--frames` the whole sequence is rendered.
 """
 _SECTIONS = {
     "rooms": "Rooms\n\nColour on the left, exact depth on the right (dark is near, white has none).",
