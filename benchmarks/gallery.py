@@ -47,7 +47,7 @@ _SECTIONS = {
 
 @dataclass(frozen=True)
 class Entry:
-    """A picture: a frame of a config with some settings (dotted names), drawn as two panels."""
+    """A picture: a frame of a config with some settings (dotted names), drawn as two panels of its middle 1/zoom."""
 
     name: str
     title: str
@@ -56,6 +56,7 @@ class Entry:
     frame: int
     set: dict[str, Any]
     panels: tuple[str, str]
+    zoom: int
 
     @property
     def command(self) -> list[str]:
@@ -67,7 +68,7 @@ class Entry:
 def entries() -> dict[str, list[Entry]]:
     """What gallery.yaml lists, by section. Raises UserError: it cannot be read."""
     listed = read_yaml(Path(__file__).with_suffix(".yaml"))
-    defaults = {"set": {}, "panels": ("color", "exact_depth")}
+    defaults = {"set": {}, "panels": ("color", "exact_depth"), "zoom": 1}
     return {section: [Entry(**{**defaults, **entry}) for entry in listed[section]] for section in _SECTIONS}
 
 
@@ -85,7 +86,7 @@ def page() -> str:
 
 def picture(entry: Entry, sequence: RenderedSequence) -> bytes:
     """A JPEG of the sequence's first image: the entry's two panels beside each other."""
-    panels = [_resized(_panel(name, sequence)) for name in entry.panels]
+    panels = [_resized(_panel(name, sequence), entry.zoom) for name in entry.panels]
     gap = np.full((HEIGHT, GAP, 3), 255, np.uint8)
     written = io.BytesIO()
     Image.fromarray(np.hstack([panels[0], gap, panels[1]])).save(written, "JPEG", quality=QUALITY, optimize=True)
@@ -171,8 +172,11 @@ def _flow(flow: Float32Array) -> ByteArray:
     return cv2.cvtColor(hsv.astype(np.uint8), cv2.COLOR_HSV2RGB).astype(np.uint8)
 
 
-def _resized(image: ByteArray) -> ByteArray:
-    return cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.uint8)
+def _resized(image: ByteArray, zoom: int) -> ByteArray:
+    """The middle 1/zoom of the image (h, w, 3), in a panel's size."""
+    top, left = (n * (zoom - 1) // (2 * zoom) for n in image.shape[:2])
+    middle = image[top : top + image.shape[0] // zoom, left : left + image.shape[1] // zoom]
+    return cv2.resize(middle, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 if __name__ == "__main__":

@@ -27,17 +27,23 @@ def test_the_page_is_what_is_listed_and_every_picture_is_there_and_small() -> No
 
 
 def test_every_config_of_it_ships() -> None:
-    assert len(ENTRIES) > 10 and all(config_file(entry.config).is_file() for entry in ENTRIES)
+    assert len(ENTRIES) > 8 and all(config_file(entry.config).is_file() for entry in ENTRIES)
 
 
 def test_a_picture_has_its_two_panels(tmp_path: Path) -> None:
     sequence = read_sequence(make_sequence(tmp_path / "box", frames=1))
-    drawn = Image.open(io.BytesIO(gallery.picture(replace(ENTRIES[0], panels=("color", "depth")), sequence)))
+    drawn = Image.open(io.BytesIO(gallery.picture(replace(ENTRIES[0], panels=("color", "depth"), zoom=1), sequence)))
     image = np.asarray(drawn).astype(float)
     left, right = image[:, : gallery.WIDTH], image[:, -gallery.WIDTH :]
     wanted = np.asarray(Image.fromarray(sequence.color(0)).resize((gallery.WIDTH, gallery.HEIGHT))).astype(float)
     assert np.corrcoef(left.ravel(), wanted.ravel())[0, 1] > 0.95
     assert np.abs(left - right).mean() > 20
+
+
+def test_a_zoomed_picture_shows_the_middle(tmp_path: Path) -> None:
+    image = np.zeros((480, 640, 3), np.uint8)
+    image[120:360, 160:480] = 255
+    assert (gallery._resized(image, 2) == 255).all() and not gallery._resized(image, 1)[:50].any()
 
 
 def test_depth_is_dark_where_it_is_near_and_white_where_there_is_none() -> None:
