@@ -96,7 +96,7 @@ def test_times_are_those_of_the_first_and_the_last_line(tmp_path: Path) -> None:
 
 def test_without_the_library_it_is_said_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ncore.data.v4", None)
-    with pytest.raises(UserError, match=r"\[ncore\]"):
+    with pytest.raises(UserError, match=r"needs nvidia-ncore: pip install .*nvidia-ncore"):
         export_ncore(make(tmp_path), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
