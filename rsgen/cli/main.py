@@ -15,7 +15,7 @@ from typing import Annotated, Any
 from rsgen.cli.motion import fit, stats, suggest
 from rsgen.cli.results import export, info, preview, verify
 from rsgen.config.sections import Up
-from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, print_figures, run_program
+from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, SkipMissing, print_figures, run_program
 from rsgen.console.configs import ConfigFile, config_file
 from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.errors import UserError
@@ -151,6 +151,7 @@ def render(
     out: Annotated[Path | None, "folder of the sequence (default: out/NAME)", "DIR"] = None,
     frames: Frames = None,
     scheduler: Scheduler = None,
+    skip_missing: SkipMissing = False,
     quiet: Quiet = False,
     **fields: str,
 ) -> int:
@@ -159,7 +160,7 @@ def render(
     from rsgen.console.progress import ProgressDisplay
     from rsgen.produce.generate import render_sequence
 
-    chosen = load_config(config, fields)
+    chosen = load_config(config, fields | ({"scene.skip_missing": "true"} if skip_missing else {}))
     out = out or Path("out") / chosen.name
     with ProgressDisplay(quiet) as progress, open_workers(scheduler) as workers:
         render_sequence(chosen, out, frames or slice(None), progress, workers if scheduler else None)
