@@ -83,7 +83,7 @@ def _parser() -> Parser:
     with_fields = [add(render, "demo --out out/trial --frames 0:10 --color.spp 64 --depth.readout_s 0")]
     add(info, "out/demo")
     add(verify, "out/demo --pairs 50", "out/demo --light 5")
-    add(preview, "out/demo --count 6", "out/demo --frame 20",
+    add(preview, "out/demo --count 6", "out/demo --frame 20", "room.yaml --every 1",
         "ours.ply theirs.ply --out meshes.png --label ours --label theirs")  # fmt: skip
     add(export, "euroc out/table1")
     with_fields += [add(pack, "demo office1 --count 1000 --out packs/rooms --color.spp 8 --truth.spp 8")]

@@ -157,8 +157,9 @@ _WORTH = (-3.0, 0.0, 1.0, 1.0, 0.3, -0.3)
 _NOTHING = -5.0
 _SHAPE = 0.8
 _DETAIL = 2.5
-# A view without edges in colour is as bad as one whose surfaces are 60 cm away, a burnt-out one as one of nothing.
-_PLAIN, _BURNT, _EDGES = 2.0, 5.0, 0.05
+# A view without edges in colour is as bad as one whose surfaces are 60 cm away. A tenth of it burnt out is worse: the
+# whole tour is to be exposed for that then.
+_PLAIN, _BURNT, _EDGES = 2.0, 25.0, 0.05
 _AHEAD = 0.7
 _CHANCE = 0.15
 _EASY_DEG = 30.0
@@ -252,7 +253,7 @@ def _views(p_world: FloatArray, cast: Cast, color: FloatArray | None = None) -> 
         if color is not None:
             part = color[..., rows].mean(axis=3)
             edges, burnt = np.mean([np.roll(part, k, axis=2) for k in range(-half, half + 1)], axis=0)
-            views[-1] -= _PLAIN * np.clip(1.0 - edges / _EDGES, 0.0, 1.0) + _BURNT * burnt
+            views[-1] -= _PLAIN * np.clip(1.0 - edges / _EDGES, 0.0, 1.0) + np.minimum(_BURNT * burnt, -_NOTHING)
     return np.stack(views, axis=-1)
 
 

@@ -54,7 +54,7 @@ from rsgen.produce.views import (
     views_along,
 )
 
-_ATTEMPTS = 4
+_ATTEMPTS = 3
 _CALM = (0.08, 0.2, 1.0, 4.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
@@ -205,8 +205,8 @@ def _looked_at(scene: TourScene, config: Config, spline: Spline, least: float) -
 
 
 def _merit(tour: Tour) -> tuple[bool, float]:
-    """By which one of two tours is preferred."""
-    return tour.flat <= _FLAT, tour.scores.worst
+    """By which one of two tours is preferred: its worst views first, and all where these are alike."""
+    return tour.flat <= _FLAT, tour.scores.worst + 0.3 * float(tour.scores.worth.mean())
 
 
 def _through(scene: TourScene, plan: FloorPlan, wish: Wish, rng: np.random.Generator) -> list[tuple[Waypoint, ...]]:

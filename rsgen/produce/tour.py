@@ -21,7 +21,7 @@ from rsgen.produce.views import MOST_CLIPPED, Exposure, Scores, Shine
 REACH_M = 1.0  # surfaces farther off are not reported
 _LARGEST_THING_M = 50.0
 _SEEN_M = (0.4, 5.0)
-_VIEWS, _MOST_VIEWS = 40, 120
+_VIEWS, _MOST_VIEWS = 20, 120
 _AS_WISHED = 1.1
 _EMPTY = 0.3
 

@@ -44,9 +44,9 @@ _PANORAMA_DEG = 3.75
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """What a camera sees at instants of a tour. light: (2, n, h, w, 3) linear radiance, independent halves, specks
-    taken out. shape: (n,) smallest eigenvalue of the point-to-plane information a pixel, rotations scaled by the mean
-    depth: near 0 where depth leaves a motion open. nearest: (n,) m, of all but a hundredth of the pixels.
+    """What a camera sees at instants of a tour. light: (2, n, h, w, 3) linear radiance, independent halves, each
+    pixel the mean of nine. shape: (n,) smallest eigenvalue of the point-to-plane information a pixel, rotations scaled
+    by the mean depth: near 0 where depth leaves a motion open. nearest: (n,) m, of all but a hundredth of the pixels.
     """
 
     light: Float32Array
@@ -124,13 +124,12 @@ def views_along(T_world_cam: FloatArray, camera: Camera, cast: Cast, shine: Shin
     constraint = np.array([_constraint(p, n, d < _FAR_M) for p, n, d in seen])
     nearest = np.quantile(distance.reshape(shape), 0.01, axis=1, method="lower")
     light = shine(origin, direction, 0).reshape(2, len(T_world_cam), *rays.shape)
-    return Views(_without_specks(light), constraint, nearest)
+    return Views(_smoothed(light), constraint, nearest)
 
 
-def _without_specks(light: Float32Array) -> Float32Array:
-    """Pictures (2, n, h, w, 3), each pixel the median of the nine about it: single bright paths would count as clipped.
-    """
-    return np.array([[cv2.medianBlur(picture, 3) for picture in half] for half in light.astype(np.float32)])
+def _smoothed(light: Float32Array) -> Float32Array:
+    """Pictures (2, n, h, w, 3), each pixel the mean of the nine about it: so few samples scatter much."""
+    return np.array([[cv2.blur(picture, (3, 3)) for picture in half] for half in light.astype(np.float32)])
 
 
 def _constraint(p: FloatArray, normal: FloatArray, counts: BoolArray) -> float:
@@ -146,10 +145,15 @@ def _constraint(p: FloatArray, normal: FloatArray, counts: BoolArray) -> float:
 def score(views: Views, brightness: FloatArray) -> Scores:
     """How good views are with their light multiplied by brightness (n,)."""
     exposed = views.light * brightness.astype(np.float32)[None, :, None, None, None]
-    mean = exposed.mean(axis=0)
-    clipped, dark = (mean.max(axis=-1) >= 1).mean(axis=(1, 2)), (mean.max(axis=-1) < _DARK).mean(axis=(1, 2))
+    peak = _peak(exposed)
+    clipped, dark = (peak >= 1).mean(axis=(1, 2)), (peak < _DARK).mean(axis=(1, 2))
     edges = _edge_map(exposed).mean(axis=(1, 2))
     return Scores(clipped, dark, np.maximum(edges, 0.0), views.shape, views.nearest)
+
+
+def _peak(light: Float32Array) -> Float32Array:
+    """(n, h, w): the largest channel of pictures (2, n, h, w, 3), of the darker half: a speck is in one of them."""
+    return np.asarray(light.max(axis=-1).min(axis=0))
 
 
 def _edge_map(exposed: Float32Array) -> FloatArray:
@@ -168,7 +172,7 @@ def suggested_exposure(light: Float32Array, gain: float) -> Exposure | None:
     The typical surface becomes mid-grey, or darker where most of the bright part would be white, or more than
     MOST_CLIPPED of the pixels clipped. Automatic exposure where that leaves much of the tour dark and it would less.
     """
-    peak, typical = light.mean(axis=0).max(axis=-1), _typical_gain(light)
+    peak, typical = _peak(light), _typical_gain(light)
     if typical is None:
         return None
     most = 1.0 / max(float(np.quantile(peak, 1.0 - _AIMED * MOST_CLIPPED)), 1e-12)
@@ -227,10 +231,10 @@ def plainness(p_world: FloatArray, shine: Shine, azimuths: int, elevations_deg: 
     rays = np.stack([level * np.cos(azimuth), np.sin(elevation), level * np.sin(azimuth)], axis=-1)
     flat = np.tile(rays.reshape(-1, 3), (len(p_world), 1))
     light = shine(np.repeat(p_world, rays[..., 0].size, axis=0), flat, 0).reshape(2, len(p_world), *rays.shape)
-    light = _without_specks(light)
+    light = _smoothed(light)
     gain = _typical_gain(light)
     exposed = light * np.float32(1.0 if gain is None else gain)
-    maps = np.stack([_edge_map(exposed), exposed.mean(axis=0).max(axis=-1) >= 1])
+    maps = np.stack([_edge_map(exposed), _peak(exposed) >= 1])
     cells = maps.reshape(2, len(p_world), azimuths, wide, len(elevations_deg), high)
     return np.asarray(cells.mean(axis=(3, 5)))
 
@@ -250,4 +254,3 @@ def path_traced(scene: Any) -> Shine:
         return np.stack(halves)
 
     return shine
-
