@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from rsgen.cli.motion import fit, stats, suggest
 from rsgen.cli.results import export, info, preview, verify
 from rsgen.config.sections import Up
-from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, print_figures, run_program
+from rsgen.console.command_line import Commands, Frames, Json, Parser, Quiet, SkipMissing, print_figures, run_program
 from rsgen.console.configs import ConfigFile, config_file
 from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.errors import UserError
@@ -93,7 +93,7 @@ def _parser() -> Parser:
     with_fields = [add(render, "demo --out out/trial --frames 0:10 --color.spp 64 --depth.readout_s 0")]
     add(info, "out/demo")
     add(verify, "out/demo --pairs 50", "out/demo --light 5")
-    add(preview, "out/demo --count 6", "out/demo --frame 20",
+    add(preview, "out/demo --count 6", "out/demo --frame 20", "room.yaml --every 1",
         "ours.ply theirs.ply --out meshes.png --label ours --label theirs")  # fmt: skip
     add(export, "euroc out/table1")
     with_fields += [add(pack, "demo office1 --count 1000 --out packs/rooms --color.spp 8 --truth.spp 8")]
@@ -162,6 +162,7 @@ def render(
     out: Annotated[Path | None, "folder of the sequence (default: out/NAME)", "DIR"] = None,
     frames: Frames = None,
     scheduler: Scheduler = None,
+    skip_missing: SkipMissing = False,
     quiet: Quiet = False,
     **fields: str,
 ) -> int:
@@ -170,7 +171,7 @@ def render(
     from rsgen.console.progress import ProgressDisplay
     from rsgen.produce.generate import render_sequence
 
-    chosen = load_config(config, fields)
+    chosen = load_config(config, fields | ({"scene.skip_missing": "true"} if skip_missing else {}))
     out = out or Path("out") / chosen.name
     with ProgressDisplay(quiet) as progress, open_workers(scheduler) as workers:
         render_sequence(chosen, out, frames or slice(None), progress, workers if scheduler else None)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from rsgen.config.sections import Up
-from rsgen.console.command_line import Json, print_figures
+from rsgen.console.command_line import Json, SkipMissing, print_figures
 from rsgen.console.configs import config_file
 
 
@@ -64,10 +64,12 @@ def suggest(
     clearance: Annotated[float, "least distance to the scene's surfaces, m", float] = 0.2,
     seed: Annotated[int, "another seed, another tour (default: 0)", "N", int] = 0,
     name: Annotated[str | None, "the sequence's name (default: the scene's)"] = None,
+    skip_missing: SkipMissing = False,
 ) -> int:
     """Propose a tour through a scene that has none: a config whose camera walks through the scene's largest room, or
     round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is. With
-    --like table1 it is the counterpart of table1 in this scene; --seed gives as many ways through it as are wanted.
+    --like table1 it is the counterpart of table1 in this scene; --seed gives as many ways through it as are wanted. Of
+    several tours that with the best worst views is taken; with --out each second's score is printed.
     """
     from rsgen.config.config import load_config
     from rsgen.files import atomic_write
@@ -78,11 +80,11 @@ def suggest(
     wish = wish if model is None else wish_like(model, wish)
     wish = wish if seconds is None else replace(wish, seconds=seconds)
     wish = wish if speed is None else replace(wish, speed_m_s=speed)
-    suggested = suggest_tour(scene, name, wish, scale, up, model)
+    suggested = suggest_tour(scene, name, wish, scale, up, model, skip_missing)
     text = suggested.yaml((out or Path("here.yaml")).parent)
     if out is None:
         print(text.decode(), end="")
         return 0
     atomic_write(out, text)
-    print("\n".join([*suggested.found, f"{out}: written (rsgen render {out})"]))
+    print("\n".join([*suggested.seconds, *suggested.found, f"{out}: written (rsgen render {out})"]))
     return 0

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from rsgen.console.command_line import Quiet, refuse_options
+from rsgen.console.configs import config_file
+from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.formats import EXPORTS, OF_RIGS, exporter
 
@@ -85,7 +87,9 @@ class MeshView:
 
 
 def preview(
-    what: Annotated[list[Path], "folder that 'rsgen render' wrote, or mesh files (.ply)", "SEQ|MESH"],
+    what: Annotated[
+        list[Path], "folder that 'rsgen render' wrote, mesh files (.ply), or with --every a config", "SEQ|MESH|CONFIG"
+    ],
     meshes: MeshView,
     *,
     out: Annotated[
@@ -94,24 +98,31 @@ def preview(
     count: Annotated[int | None, "frames to show (default: 4)"] = None,
     frame: Annotated[int | None, "show this frame beside the same with a global shutter, and what differs", "N", int]
     = None,
+    every: Annotated[float | None, "a contact sheet: small pictures of colour and depth every S seconds", "S", float]
+    = None,
     scene: SceneFile = None,
     quiet: Quiet = False,
 ) -> int:  # fmt: skip
     """Draw a sequence, what the rolling shutter did to one of its frames, or meshes. Of a sequence some frames with
-    their depth, with --frame N that one: global shutter, rolling shutter and their difference. Meshes side by side,
-    seen by one camera from above or from a place you name.
+    their depth, with --frame N that one: global shutter, rolling shutter and their difference. With --every S a contact
+    sheet of a sequence, or of the motion of a config that has not been rendered yet. Meshes side by side, seen by one
+    camera from above or from a place you name.
     """
     from rsgen.console.progress import ProgressDisplay
     from rsgen.pictures.frames import compare_frame, preview_sequence
     from rsgen.pictures.meshes import parse_point, picture_meshes
 
-    of_meshes = any(path.suffix and not path.is_dir() for path in what)
+    of_meshes = every is None and any(path.suffix and not path.is_dir() for path in what)
     if of_meshes:
         refuse_options("meshes", {"--count": count, "--frame": frame is not None, "--scene": scene})
     else:
         _refuse_others("a sequence", meshes, MeshView())
         if len(what) > 1:
             raise UserError(f"{what[1]}: is more than one sequence: give one")
+    if every is not None:
+        refuse_options("a contact sheet", {"--count": count, "--frame": frame is not None, "--scene": scene})
+        if every <= 0:
+            raise UserError(f"--every {every:g}: must be above 0 s")
     with ProgressDisplay(quiet) as progress:
         if of_meshes:
             if out is None:
@@ -119,6 +130,8 @@ def preview(
             eye, target = (None if text is None else parse_point(text) for text in (meshes.from_, meshes.at))
             size = meshes.width, meshes.height
             made = picture_meshes(what, out, meshes.label, eye, target, *size, meshes.grey, progress)
+        elif every is not None:
+            made = _contact_sheet(what[0], out, every, progress)
         elif frame is None:
             refuse_options("a preview without --frame", {"--scene": scene})
             made = preview_sequence(what[0], out, count or 4)
@@ -127,6 +140,16 @@ def preview(
             made = compare_frame(what[0], frame, out, scene, progress)
     print(made)
     return 0
+
+
+def _contact_sheet(what: Path, out: Path | None, every_s: float, progress: Progress) -> Path:
+    """Of a sequence, else of the config that is called so."""
+    from rsgen.config.config import load_config
+    from rsgen.pictures.sheet import sheet_of_config, sheet_of_sequence
+
+    if what.is_dir():
+        return sheet_of_sequence(what, out, every_s)
+    return sheet_of_config(load_config(config_file(str(what))), out, every_s, progress)
 
 
 def _refuse_others(what: str, given: object, default: object) -> None:

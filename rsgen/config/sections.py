@@ -60,6 +60,11 @@ class SceneConfig(Section):
         default="auto", description="light of a mesh file; auto: lamps under a room's ceiling, a sky around objects"
     )
 
+    skip_missing: bool = Field(
+        default=False,
+        description="leave out meshes, textures and sky pictures that are not there, as --skip-missing",
+    )
+
     @model_validator(mode="after")
     def _is_a_mesh_if_lit(self) -> SceneConfig:
         if self.file.suffix.lower() == ".xml" and self.light != "auto":

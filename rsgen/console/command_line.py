@@ -284,3 +284,4 @@ def parse_frames(text: str | None) -> slice:
 Frames = Annotated[slice | None, "only frames A to B-1 (default: all)", "A:B", parse_frames]
 Json = Annotated[bool, "print machine-readable figures"]
 Quiet = Annotated[bool, "no progress"]
+SkipMissing = Annotated[bool, "leave out meshes, textures and sky pictures that the scene names and that are not there"]

@@ -94,7 +94,7 @@ def config_of(path: Path, meta: dict[str, Any], scene: Path | None) -> Config:
     file = scene or Path(str(origin.get("scene", "")))
     if not file.is_file():
         raise UserError(f"{path}: its scene '{file}' is not on this machine: name it with --scene")
-    recorded["scene"] = {"file": str(file.resolve())}
+    recorded["scene"] = _mapping(recorded.get("scene")) | {"file": str(file.resolve())}
     if recorded.get("motion") is None:
         trajectory = {"file": str(origin.get("trajectory", "unused"))}
         recorded["trajectory"] = _mapping(recorded.get("trajectory")) | trajectory

@@ -145,7 +145,7 @@ def scene_hash(config: Config) -> str:
 def _options(scene: SceneConfig) -> Any:
     from rsgen.render.placement import SceneOptions
 
-    return SceneOptions(scene.scale, scene.up, scene.light)
+    return SceneOptions(scene.scale, scene.up, scene.light, scene.skip_missing)
 
 
 def surfaces_hash(config: Config) -> str:

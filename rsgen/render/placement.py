@@ -40,12 +40,14 @@ _AXES: tuple[tuple[Up, Up], ...] = (("x", "-x"), ("y", "-y"), ("z", "-z"))
 class SceneOptions:
     """How a file becomes a scene: metres per unit of the file, which of its axes is up, what lights it.
 
-    light: of a mesh file only, see `rsgen.formats.meshes.default_light`.
+    light: of a mesh file only, see `rsgen.formats.meshes.default_light`. skip_missing: files that it names and that are
+    not there are left out rather than refused.
     """
 
     scale: float = 1.0
     up: Up = "y"
     light: SceneLight = "auto"
+    skip_missing: bool = False
 
 
 AS_IT_IS = SceneOptions()

@@ -15,6 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from rsgen.render.xml_scene import (
     explained,
     log_renamed,
     messages_to_log,
+    missing_file,
     parse,
     prepare,
     unknown_properties,
@@ -95,7 +97,7 @@ def ensure_built(path: Path) -> None:
 def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
     """SHA-256 over the scene file, every file that it includes or names (meshes, textures), and the options.
 
-    Raises UserError if one is missing or the scene file is malformed.
+    Raises UserError if one is missing, unless they say to leave it out, or the scene file is malformed.
     """
     ensure_built(path)
     digest = hashlib.sha256(path.read_bytes())
@@ -116,7 +118,7 @@ def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
         state, changes = parsed.state, parsed.changes
         if changes is not None:
             digest.update(xml_helper("older version").METHOD)
-        if options != AS_IT_IS:
+        if options != replace(AS_IT_IS, skip_missing=options.skip_missing):
             digest.update(f"\0{options.scale!r} {options.up}".encode())
         for included in state.files[1:] if changes is None else changes.files:
             digest.update(hashlib.sha256(Path(str(included)).read_bytes()).digest())
@@ -124,7 +126,10 @@ def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
         for name in sorted(names):
             file = path.parent / name
             if not file.is_file():
-                raise UserError(f"scene {path}: file '{name}' that it names is missing")
+                if not options.skip_missing:
+                    raise UserError(missing_file(path, name))
+                digest.update(name.encode() + b"\0missing")
+                continue
             data = file.read_bytes()
             digest.update(name.encode() + b"\0" + hashlib.sha256(data).digest())
             if file.suffix.lower() == ".obj":
@@ -182,7 +187,7 @@ def _instantiated(mi: Any, config: Any, parsed: Parsed, path: Path, scratch: Pat
             raise UserError(f"scene {path}: shape '{plugin}' cannot become triangles: export it as a mesh (.ply, .obj)")
         if plugin in ANALYTIC:
             node.props = tessellated(mi, node.props, scratch / f"{index}.ply")
-    check_files(mi, state, path)
+    check_files(mi, state, path, options.skip_missing)
     if any(node.type == mi.ObjectType.Shape and node.props.plugin_name() == "obj" for node in state.nodes):
         xml_helper("mesh files").read_polygons(mi, state, scratch)
     if parsed.changes is not None:

@@ -123,19 +123,58 @@ def _sample_blends_from_behind(mi: Any, state: Any) -> None:
                 props["sample_visible"] = False
 
 
-def check_files(mi: Any, state: Any, path: Path) -> None:
-    """Raise UserError if a mesh or an image that the scene names is not there, or too large to be read."""
-    for node in state.nodes:
+def check_files(mi: Any, state: Any, path: Path, skip_missing: bool = False) -> None:
+    """Raise UserError if a mesh or an image that the scene names is not there, or too large to be read.
+
+    skip_missing: leave out what is not there, in place, with a warning each, where the scene can do without.
+    """
+    for number, node in enumerate(state.nodes):
         name = str(node.props["filename"]) if "filename" in node.props else None
         if name is None:
             continue
         file = Path(str(mi.file_resolver().resolve(name)))
         if not file.is_file():
-            raise UserError(f"scene {path}: file '{name}' is missing: put it there, or mend its path in the scene")
+            if not skip_missing or not _left_out(mi, state, number):
+                raise UserError(missing_file(path, name))
+            log.warning("scene %s: file '%s' is missing: rendered without it", path, name)
+            continue
         with file.open("rb") as opened:
             width, height = image_size(opened.read(_HEADER_BYTES)) or (0, 0)
         if width * height > MOST_PIXELS or file.stat().st_size > MOST_BYTES:
             raise UserError(f"scene {path}: file '{name}' is too large to be read: make it smaller")
+
+
+def missing_file(path: Path, name: str) -> str:
+    """What is wrong with a scene that names a file that is not there, and how it is mended."""
+    return (
+        f"scene {path}: file '{name}' that it names is missing: put it there, mend its path in the scene, "
+        "or leave it out with --skip-missing"
+    )
+
+
+def _left_out(mi: Any, state: Any, number: int) -> bool:
+    """Take what needs a missing file out of a parsed scene, in place: a mesh altogether; a picture's place takes one
+    even pixel, of a sky too. False where nothing can stand for it.
+    """
+    node, kind = state.nodes[number], mi.ObjectType
+    holders = [(holder, key) for holder in state.nodes for key, child in children(mi, holder.props) if child == number]
+    if node.type == kind.Shape:
+        for holder, key in holders:
+            del holder.props[key]
+        node.props = mi.Properties("cube")  # which nobody holds, and so is not made
+        return True
+    plugin = node.props.plugin_name()
+    if plugin not in ("bitmap", "envmap"):
+        return False
+    value = [0.5, 0.5, 0.5]
+    if plugin == "envmap" or any(key == "opacity" for _, key in holders):
+        value = [1.0, 1.0, 1.0]
+    elif any(holder.props.plugin_name() == "normalmap" for holder, _ in holders):
+        value = [0.5, 0.5, 1.0]
+    size = (2, 4, 3) if plugin == "envmap" else (1, 1, 3)
+    del node.props["filename"]
+    node.props["bitmap"] = mi.Bitmap(np.broadcast_to(np.array(value, np.float32), size).copy())
+    return True
 
 
 @contextlib.contextmanager

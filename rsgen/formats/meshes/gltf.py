@@ -48,9 +48,9 @@ def read_header(path: Path) -> tuple[dict[str, Any], bytes]:
     return header, chunks
 
 
-def external_files(header: dict[str, Any]) -> list[str]:
-    """Names of the files that the JSON refers to, relative to its own."""
-    uris = [str(item["uri"]) for key in ("buffers", "images") for item in header.get(key, []) if "uri" in item]
+def external_files(header: dict[str, Any], kinds: tuple[str, ...] = ("buffers", "images")) -> list[str]:
+    """Names of the files of such kinds that the JSON refers to, relative to its own."""
+    uris = [str(item["uri"]) for key in kinds for item in header.get(key, []) if "uri" in item]
     return [unquote(uri) for uri in uris if not uri.startswith("data:")]
 
 

@@ -24,11 +24,12 @@ from rsgen.errors import UserError
 from rsgen.formats.meshes import gltf
 from rsgen.formats.meshes.default_light import light_shapes
 from rsgen.formats.meshes.parts import Part, finished, placed
+from rsgen.image_codecs import encode_png
 from rsgen.inputs import check_input
 from rsgen.render.material import Material, Texture, bsdf, emitter
 from rsgen.render.meshes import ply_bytes
 from rsgen.render.placement import SceneOptions, world_from_file
-from rsgen.render.xml_scene import located
+from rsgen.render.xml_scene import located, missing_file
 
 log = logging.getLogger("rsgen")
 
@@ -36,6 +37,7 @@ log = logging.getLogger("rsgen")
 _READING = 1
 _GREY = Material()
 _WHITE = Material(color=np.ones(3))
+_GREY_PICTURE = encode_png(np.full((1, 1, 3), 188, np.uint8))  # half of the light, in place of one that is missing
 _BLENDED = 0.5  # cover from which a blended surface counts as there
 _RENDERED = {"KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_materials_pbrSpecularGlossiness"}
 
@@ -51,7 +53,7 @@ def read_parts(path: Path, options: SceneOptions) -> list[Part]:
 def _nodes(path: Path, options: SceneOptions) -> list[tuple[str, Part]]:
     """Nodes that have triangles, by name, in the world."""
     data, header = path.read_bytes(), None
-    files = {name: file.read_bytes() for name, file in referenced_files(path).items()}
+    files = _contents(path, options.skip_missing)
     if path.suffix.lower() in gltf.SUFFIXES:
         header, chunks = gltf.read_header(path)
         data = gltf.for_trimesh(path, header, chunks)
@@ -110,45 +112,52 @@ def part_shapes(mi: Any, parts: Sequence[Part], folder: Path) -> dict[str, Any]:
     return shapes
 
 
-def referenced_files(path: Path) -> dict[str, Path]:
-    """Files that a mesh file names (buffers, materials, textures), by the name used there.
+def _contents(path: Path, skip_missing: bool) -> dict[str, bytes]:
+    """What is in the files that a mesh file names (buffers, materials, textures), by the name used there.
 
-    Raises UserError if one is missing.
+    Raises UserError if one is missing. skip_missing: a picture that is is an even grey, materials are none.
     """
     suffix = path.suffix.lower()
+    libraries: list[str] = []
     if suffix in gltf.SUFFIXES:
-        names = gltf.external_files(gltf.read_header(path)[0])
-        return {name: _beside(path, name) for name in names}
-    if suffix == ".obj":
-        libraries = {name: _beside(path, name) for name in _named(path.read_bytes(), rb"mtllib")}
-        textures = {name for file in libraries.values() for name in _named(file.read_bytes(), rb"map_Kd")}
-        return libraries | {name: _beside(path, name) for name in sorted(textures)}
-    if suffix == ".ply":
+        header = gltf.read_header(path)[0]
+        names, buffers = gltf.external_files(header), gltf.external_files(header, ("buffers",))
+    elif suffix == ".obj":
+        names = libraries = _named(path.read_bytes(), rb"mtllib")
+        buffers = []
+    elif suffix == ".ply":
         with path.open("rb") as file:
             head = file.read(1 << 16).partition(b"end_header")[0]
-        return {name: _beside(path, name) for name in _named(head, rb"comment\s+TextureFile")}
-    return {}
+        names, buffers = _named(head, rb"comment\s+TextureFile"), []
+    else:
+        return {}
+
+    def read(name: str) -> bytes:
+        file = located(path.parent, name)
+        if file is not None and file.is_file():
+            check_input(file)
+            return file.read_bytes()
+        if not skip_missing or name in buffers:
+            raise UserError(missing_file(path, name))
+        log.warning("scene %s: file '%s' is missing: rendered without it", path, name)
+        return b"" if name in libraries else _GREY_PICTURE
+
+    contents = {name: read(name) for name in names}
+    textures = {name for library in libraries for name in _named(contents[library], rb"map_Kd")}
+    return contents | {name: read(name) for name in sorted(textures)}
 
 
 def hash_into(digest: Any, path: Path, options: SceneOptions) -> None:
     """Add to a hash of the file itself all else that decides its scene. Raises UserError if a file is missing."""
     digest.update(f"\0{_READING} {options.scale!r} {options.up} {options.light}".encode())
-    for name, file in sorted(referenced_files(path).items()):
-        digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    for name, data in sorted(_contents(path, options.skip_missing).items()):
+        digest.update(name.encode() + b"\0" + hashlib.sha256(data).digest())
 
 
 def _named(text: bytes, keyword: bytes) -> list[str]:
     """What follows a keyword at the beginning of lines, each once."""
     found = re.findall(rb"^[ \t]*" + keyword + rb"[ \t]+(.+?)\s*$", text, re.MULTILINE | re.IGNORECASE)
     return list(dict.fromkeys(name.decode(errors="replace") for name in found))
-
-
-def _beside(path: Path, name: str) -> Path:
-    file = located(path.parent, name)
-    if file is None or not file.is_file():
-        raise UserError(f"scene {path}: file '{name}' that it names is missing: put it there, or take its name out")
-    check_input(file)
-    return file
 
 
 def _refuse_unreadable_texture(path: Path, name: str, data: bytes) -> None:

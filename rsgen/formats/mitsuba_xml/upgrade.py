@@ -119,6 +119,9 @@ def multiply_images(mi: Any, state: Any) -> None:
         if FACTOR not in node.props:
             continue
         props, factor = node.props, np.array(numbers(node.props[FACTOR]), np.float32)
+        if "filename" not in props:  # a missing one was left out
+            del props[FACTOR]
+            continue
         file = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
         pixels = _pixels(mi, file, bool(props.get("raw", False)), bool((factor != factor[0]).any()))
         channels = min(3, pixels.shape[2] - (pixels.shape[2] in (2, 4)))  # but not alpha

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import math
 import os
 import signal
 import subprocess
@@ -89,6 +90,23 @@ def test_pictures_are_written(whole: Path, tmp_path: Path, words: list[str], def
         image = cv2.imread(str(path))
         assert image.shape[0] > 400 and image.shape[1] > 1000 and image.std() > 20
     (whole / default).unlink()
+
+
+def test_contact_sheets(whole: Path, config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for k, what in enumerate((whole, config)):
+        out = tmp_path / f"{k}.png"
+        assert main(["preview", str(what), "--every", "0.06", "--out", str(out), "--quiet"]) == 0
+        image = cv2.imread(str(out))
+        columns = math.floor((FRAMES - 1) / 30 / 0.06) + 1
+        assert image.shape[1] // columns in range(48, 52) and image.std() > 20
+    for words in (
+        ["--every", "0"],
+        ["--every", "1e-5"],
+        ["--every", "1", "--out", "x.jpg"],
+        ["--every", "1", "--count", "3"],
+    ):
+        assert main(["preview", str(whole), *words]) == 2
+    assert capsys.readouterr().err.count("\n") == 4
 
 
 def test_compare_needs_no_origin_if_the_scene_is_named(folder: Path, whole: Path, tmp_path: Path) -> None:
