@@ -86,7 +86,8 @@ def sheet(color: Sequence[ByteArray], depth: Sequence[Float32Array], t: FloatArr
     """
     seen = np.concatenate([z[z > 0].ravel() for z in depth])
     far = float(np.quantile(seen, _FAR)) if len(seen) else 1.0
-    height, width = (max(image.shape[k] for image in (*color, *depth)) for k in (0, 1))
+    shapes = [image.shape[:2] for image in color] + [z.shape for z in depth]
+    height, width = (max(shape[k] for shape in shapes) for k in (0, 1))
     columns = min(_COLUMNS, len(t))
     high, wide = 2 * height + _LABEL + _GAP, width + _GAP
     whole = np.full((math.ceil(len(t) / columns) * high, columns * wide, 3), 255, np.uint8)
@@ -104,7 +105,7 @@ def _instants(first: float, last: float, every_s: float) -> FloatArray:
     count = math.floor((last - first) / every_s + 1e-9) + 1
     if count > _MOST:
         raise UserError(f"--every {every_s:g}: makes {count} pictures, at most {_MOST} are shown: take a longer time")
-    return first + every_s * np.arange(count)
+    return np.asarray(first + every_s * np.arange(count), float)
 
 
 def _shrunk(image: np.ndarray) -> np.ndarray:

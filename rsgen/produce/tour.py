@@ -132,7 +132,7 @@ class Tour:
 def view_times(seconds: float) -> FloatArray:
     """Instants (n,) in s that views are looked at, over all of a made motion."""
     count = min(max(_VIEWS, math.ceil(seconds)), _MOST_VIEWS)
-    return (np.arange(count) + 0.5) * (seconds / count)
+    return np.asarray((np.arange(count) + 0.5) * (seconds / count), float)
 
 
 def room_text(plan: FloorPlan, clearance_m: float) -> str:
