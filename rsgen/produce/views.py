@@ -113,7 +113,7 @@ def views_along(T_world_cam: FloatArray, camera: Camera, cast: Cast, shine: Shin
     small = small_camera(camera, _WIDTH)
     rays = small.unproject(small.pixel_grid())
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    sees: BoolArray = np.isfinite(rays).all(axis=-1)
+    sees: BoolArray = np.asarray(np.isfinite(rays).all(axis=-1))
     rays = np.where(sees[..., None], rays, [0.0, 0.0, 1.0])  # a lens may see nothing in its corners
     shape = len(T_world_cam), rays.shape[0] * rays.shape[1]
     direction = np.einsum("nij,rj->nri", T_world_cam[:, :3, :3], rays.reshape(-1, 3)).reshape(-1, 3)
