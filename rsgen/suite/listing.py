@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from rsgen.config.cameras import ColorConfig
 from rsgen.config.config import Config
 from rsgen.console.tables import Table
-from rsgen.produce.parts import load_motion, sequence_stamps
+from rsgen.sequence.trajectory import read_trajectory
 from rsgen.suite.definition import Definition, Entry
 
 # Measured on office1 at 320x240, 16 spp, on two cores without other work: for an estimate, before anything is rendered.
@@ -35,9 +35,9 @@ def estimate(configs: Iterable[Config]) -> Estimate:
     """By the number of pixels and samples alone: other scenes and machines differ by a factor of two or three."""
     frames, seconds, size = 0, 0.0, 0.0
     for config in configs:
-        stamps = sequence_stamps(config, load_motion(config))
-        for name, camera in config.cameras.items():
-            count, pixels = len(stamps[name]), camera.width * camera.height
+        lasts = _duration(config)
+        for camera in config.cameras.values():
+            count, pixels = int((lasts - camera.offset_s) * camera.rate_hz + 1e-6) + 1, camera.width * camera.height
             extra = len(config.truth.images) if isinstance(camera, ColorConfig) else 0
             is_color = isinstance(camera, ColorConfig)
             frames += count
@@ -45,6 +45,17 @@ def estimate(configs: Iterable[Config]) -> Estimate:
             per_pixel = _BYTES_PER_COLOR * (1 + extra) if is_color else _BYTES_PER_DEPTH
             size += count * (pixels * per_pixel + camera.height * _BYTES_PER_LINE / 2)
     return Estimate(frames, seconds, size)
+
+
+def _duration(config: Config) -> float:
+    """Of a sequence, s, without making its motion."""
+    if config.stretch is not None:
+        return config.stretch.duration_s
+    if config.motion is not None:
+        return config.motion.length_m / config.motion.mean_speed_m_s
+    assert config.trajectory.file is not None  # or there were a motion
+    stamps = read_trajectory(config.trajectory.file, config.trajectory.format, config.trajectory.icl_start).stamps
+    return float(stamps[-1] - stamps[0])
 
 
 def describe_suite(suite: Definition) -> str:
