@@ -88,7 +88,9 @@ def _parser() -> Parser:
     add(preview, "out/demo --count 6", "out/demo --frame 20",
         "ours.ply theirs.ply --out meshes.png --label ours --label theirs")  # fmt: skip
     add(export, "euroc out/table1")
-    suites = commands.group("suite", "Make and check benchmark suites: sequences made to be compared on, with a manifest.")
+    suites = commands.group(
+        "suite", "Make and check benchmark suites: sequences made to be compared on, with a manifest."
+    )
     suites.add(suite.list_, "", "rollingrooms")
     suites.add(suite.render, "rollingrooms --tier small --out suites/rollingrooms --scheduler local:2")
     suites.add(suite.verify, "suites/rollingrooms", "suites/rollingrooms --against other/rollingrooms")

@@ -58,8 +58,8 @@ def verify(
     ] = None,
 ) -> int:
     """Check a copy against its manifest: a line for each file that is missing or another one, status 1 if there are
-    any. With --against compare two renderings, of two types of machines, say: poses and listings have to be equal, exact
-    depth within 0.1 mm, images within a PSNR.
+    any. With --against compare two renderings, of two types of machines, say: poses and listings have to be equal,
+    exact depth within 0.1 mm, images within a PSNR.
     """
     from rsgen.suite.manifest import compare, read_manifest
     from rsgen.suite.manifest import verify as verify_copy
@@ -75,7 +75,7 @@ def verify(
 
 
 def card(folder: SuiteFolder) -> int:
-    """Write what a dataset is published with: README.md with Hugging Face's front matter, croissant.json, thumbnails."""
+    """Write what a dataset is published with: README.md with Hugging Face's front matter, croissant.json, pictures."""
     from rsgen.suite.card import write_card
 
     for path in write_card(folder):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
@@ -78,14 +79,14 @@ def draw_stretch(
     return Drawn(config, readout, exposure, start, speed, (pitch, yaw, roll), int(rng.integers(2**31)))
 
 
-def along(spline: Spline, start_s: float, speed: float, turn: Sequence[float], T_body_cam: FloatArray) -> Spline:
+def along(spline: Spline, start_s: float, speed: float, turn: npt.ArrayLike, T_body_cam: FloatArray) -> Spline:
     """T_world_cam(t) of a camera that is at the time start_s of T_world_body(t) when its own time is 0.
 
     turn (3,): rotation vector of its view, rad. Multiplied from the right, all control points move the whole curve;
     knots closer together go along it faster.
     """
     T_turn = np.eye(4)
-    T_turn[:3, :3] = so3.exp(np.array(turn))
+    T_turn[:3, :3] = so3.exp(np.asarray(turn, float))
     return Spline(spline.control_points @ T_body_cam @ T_turn, (spline.t0 - start_s) / speed, spline.dt / speed)
 
 

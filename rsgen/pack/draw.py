@@ -58,7 +58,7 @@ class PackOptions:
     @property
     def ranges(self) -> Ranges:
         """What sequences are drawn from."""
-        return Ranges(self.length, *(self.span(name) for name in _DEFAULTS), turn_deg=self.turn_deg)
+        return Ranges(self.length, self.span("readout"), self.span("exposure"), self.span("speed"), self.turn_deg)
 
     @property
     def content(self) -> dict[str, Any]:
@@ -74,5 +74,5 @@ class PackOptions:
 
 
 def camera_spline(spline: Spline, drawn: Drawn, T_depth_color: FloatArray) -> Spline:
-    """T_world_cam(t) of a sequence's colour camera, whose first frame has stamp 0, from the config's T_world_depth(t)."""
+    """T_world_cam(t) of a sequence's colour camera, with stamp 0 first, from the config's T_world_depth(t)."""
     return along(spline, drawn.start_s, drawn.speed, drawn.turn, T_depth_color)

@@ -7,7 +7,6 @@ from typing import Protocol, TypeVar
 
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
-from rsgen.errors import UserError
 
 
 class SceneJob(Protocol):

@@ -98,9 +98,7 @@ def _stretch(
             f"lasts, {last - first:g} s: begin earlier or make it shorter"
         )
     beyond = max(speed, 1.0)
-    fit = fit_spline(
-        trajectory, dt=spacing, smoothing=smoothing, pad_begin_s=beyond * before, pad_end_s=beyond * after
-    )
+    fit = fit_spline(trajectory, dt=spacing, smoothing=smoothing, pad_begin_s=beyond * before, pad_end_s=beyond * after)
     moved = along(fit.spline, first + stretch.start_s, speed, np.radians(stretch.turn_deg), np.eye(4))
     # A little more than is needed: stamps are rounded.
     begin, end = max(moved.t_begin, -before - moved.dt), min(moved.t_end, duration + after + moved.dt)

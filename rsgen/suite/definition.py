@@ -126,7 +126,9 @@ class Definition(_Part):
             lacking = [file for file in entry.data.values() if data is None or not (data / file).is_file()]
             if lacking:
                 where = "no --data was given" if data is None else f"it is not in {data}"
-                skipped.append(f"{entry.name}: skipped: needs {lacking[0]}, and {where} (see configs/{entry.config}.yaml)")
+                skipped.append(
+                    f"{entry.name}: skipped: needs {lacking[0]}, and {where} (see configs/{entry.config}.yaml)"
+                )
             else:
                 planned += _of_entry(entry, data, test_seed)
         names = [one.name for one in planned]

@@ -11,9 +11,10 @@ from rsgen.console.tables import Table
 from rsgen.sequence.trajectory import read_trajectory
 from rsgen.suite.definition import Definition, Entry
 
-# Measured on office1 at 320x240, 16 spp, on two cores without other work: for an estimate, before anything is rendered.
+# Of office1 at 320x240 and 16 spp on two cores with nothing else to do, for an estimate beforehand: seconds.
 _S_PER_SAMPLE, _S_PER_DEPTH = 5.7e-8, 3e-7
-_BYTES_PER_COLOR, _BYTES_PER_DEPTH, _BYTES_PER_LINE = 1.9, 3.4, 112.0
+# A pixel's bytes, of colour and of depth with its exact image; of the poses of a line; of the scene's surface.
+_BYTES_PER_COLOR, _BYTES_PER_DEPTH, _BYTES_PER_LINE, _BYTES_OF_SCENE = 1.7, 4.1, 56.0, 7.1e6
 
 
 @dataclass(frozen=True)
@@ -35,15 +36,17 @@ def estimate(configs: Iterable[Config]) -> Estimate:
     """By the number of pixels and samples alone: other scenes and machines differ by a factor of two or three."""
     frames, seconds, size = 0, 0.0, 0.0
     for config in configs:
-        lasts = _duration(config)
+        lasts, size = _duration(config), size + _BYTES_OF_SCENE
         for camera in config.cameras.values():
             count, pixels = int((lasts - camera.offset_s) * camera.rate_hz + 1e-6) + 1, camera.width * camera.height
-            extra = len(config.truth.images) if isinstance(camera, ColorConfig) else 0
-            is_color = isinstance(camera, ColorConfig)
-            frames += count
-            seconds += count * pixels * (_S_PER_SAMPLE * camera.spp * (1 + extra) if is_color else _S_PER_DEPTH)
-            per_pixel = _BYTES_PER_COLOR * (1 + extra) if is_color else _BYTES_PER_DEPTH
-            size += count * (pixels * per_pixel + camera.height * _BYTES_PER_LINE / 2)
+            frames, size = frames + count, size + count * camera.height * _BYTES_PER_LINE
+            if isinstance(camera, ColorConfig):
+                images = 1 + len(config.truth.images)
+                seconds += count * images * pixels * camera.spp * _S_PER_SAMPLE
+                size += count * images * pixels * _BYTES_PER_COLOR
+            else:
+                seconds += count * pixels * _S_PER_DEPTH
+                size += count * pixels * _BYTES_PER_DEPTH
     return Estimate(frames, seconds, size)
 
 

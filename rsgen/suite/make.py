@@ -9,7 +9,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +21,15 @@ from rsgen.config.config import Config
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml, read_text, read_yaml, write_error
+from rsgen.files import (
+    atomic_write,
+    encode_yaml,
+    is_temporary,
+    read_text,
+    read_yaml,
+    remove_stale_temporaries,
+    write_error,
+)
 from rsgen.produce.batches import by_scene
 from rsgen.produce.generate import ORIGIN, render_sequence
 from rsgen.produce.parts import LoadedScene, load_scene_and_light
@@ -51,9 +59,9 @@ class RenderOptions:
     hold_back_truth: Annotated[
         Path | None, "put all of test sequences that gives their motion away into this folder instead", "DIR"
     ] = None
-    test_seed: Annotated[
-        int | None, "seeds of test sequences are drawn from this number: keep it to yourself", "N"
-    ] = None
+    test_seed: Annotated[int | None, "seeds of test sequences are drawn from this number: keep it to yourself", "N"] = (
+        None
+    )
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,9 @@ def make_sequence(job: SuiteJob, progress: Progress) -> None:
     """Render one sequence, record its files, and put away what is held back. Raises UserError."""
     config = job.planned.config
     if (job.folder / "camera.yaml").is_file() and not (job.folder / "sequence.yaml").is_file():
-        raise UserError(f"{job.folder}: is without its truth, and its record is lost: delete the folder, then try again")
+        raise UserError(
+            f"{job.folder}: is without its truth, and its record is lost: delete the folder, then try again"
+        )
     render_sequence(config, job.folder, slice(None), no_progress, None, _loaded_scene(job, progress))
     try:
         if job.truth is not None:
@@ -165,7 +175,7 @@ def _loaded_scene(job: SuiteJob, progress: Progress) -> LoadedScene | None:
 
 
 def _stated_cameras(config: Config) -> dict[str, Any]:
-    """A camera.yaml of what sequence.yaml states: with a driver's stamps, colour's offset is for the tracker to find."""
+    """A camera.yaml of what sequence.yaml states: of a driver's stamps colour's offset is not known."""
     color, depth, faults = config.declared_color, config.declared_depth, config.injected
     T_color_depth = np.array(config.declared_T_color_depth, float)
     is_exact = faults.color is None and faults.depth is None
@@ -216,9 +226,11 @@ def _open(out: Path, suite: Definition, planned: Sequence[Planned], options: Ren
                     f"or one with other test seeds or truth: {cure}"
                 )
             entries = {str(entry["name"]): entry for entry in old["entries"]} | entries
-        elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        elif out.exists() and (not out.is_dir() or any(not is_temporary(p) and p.name != _DONE for p in out.iterdir())):
             raise UserError(f"{out}: holds other files and no {SUITE}: {cure}")
         (out / _DONE).mkdir(parents=True, exist_ok=True)
+        for folder in (out, out / _DONE):
+            remove_stale_temporaries(folder)
     except OSError as error:
         raise write_error(out, error) from None
     about = {

@@ -223,7 +223,8 @@ def _share(mine: NDArray[Any], theirs: NDArray[Any], within: float, least: float
 
 
 def _surface(a: Path, b: Path) -> str | None:
-    return None if len(a) == len(b) else f"has {len(a)} bytes, not {len(b)}"
+    sizes = a.stat().st_size, b.stat().st_size
+    return None if sizes[0] == sizes[1] else f"has {sizes[0]} bytes, not {sizes[1]}"
 
 
 _RULES: dict[str, Callable[[Path, Path], str | None]] = {
