@@ -18,7 +18,9 @@ PLAN = ROOT / "docs/plan.svg"
 _COLUMNS = {"wings of the generator": "rsgen: the generator", "wings of the tracker": "rstrack: the tracker"}
 _GROUND = "ground stands on itself"
 # What the core does not import: formats of other programs, packs, views, peers, reports.
-_GUESTS = ("formats", "pack", "pictures", "report", "score", "bench", "charts", "view", "peers", "cli")
+_GUESTS = (
+    "formats", "pack", "suite", "pictures", "report", "score", "bench", "charts", "view", "peers", "cli",
+)  # fmt: skip
 _TITLE = "A folder may import those below it in its column, and the ground. The core never imports a guest (yellow)."
 _WIDTH, _ROW, _GAP, _MARGIN = 560, 34, 6, 20
 _COLORS = {"core": "#d5e8e4", "guest": "#f3ead2", "ground": "#dde3ee"}

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
+from rsgen.cli import suite
 from rsgen.cli.motion import fit, stats, suggest
 from rsgen.cli.results import export, info, preview, verify
 from rsgen.config.sections import Up
@@ -35,6 +36,7 @@ rsgen makes rolling-shutter RGB-D benchmark sequences with exact continuous-time
   rsgen motion fit my_trajectory.txt    how well a spline represents a recorded trajectory
   rsgen motion suggest room.xml --out room.yaml      a tour through a scene of your own, to render or to edit
   rsgen pack demo --out packs/demo      pairs of rolling and global images, for training
+  rsgen suite list                      benchmark suites: many sequences with roles, checksums and a card
   rsgen export euroc out/demo           for the tools of others: EuRoC, Kalibr, ROS, COLMAP, nerfstudio ...
 
 A config is a YAML file or a name. Scenes are built, and their light is baked, once: in a checkout beside their scripts,
@@ -96,6 +98,13 @@ def _parser() -> Parser:
     add(preview, "out/demo --count 6", "out/demo --frame 20", "room.yaml --every 1",
         "ours.ply theirs.ply --out meshes.png --label ours --label theirs")  # fmt: skip
     add(export, "euroc out/table1")
+    suites = commands.group(
+        "suite", "Make and check benchmark suites: sequences made to be compared on, with a manifest."
+    )
+    suites.add(suite.list_, "", "rollingrooms")
+    suites.add(suite.render, "rollingrooms --tier small --out suites/rollingrooms --scheduler local:2")
+    suites.add(suite.verify, "suites/rollingrooms", "suites/rollingrooms --against other/rollingrooms")
+    suites.add(suite.card, "suites/rollingrooms")
     with_fields += [add(pack, "demo office1 --count 1000 --out packs/rooms --color.spp 8 --truth.spp 8")]
     for command in with_fields:
         _add_fields(command)

@@ -26,6 +26,7 @@ from rsgen.config.sections import (
     MocapConfig,
     SceneConfig,
     Section,
+    StretchConfig,
     TargetConfig,
     TrajectoryConfig,
     TruthConfig,
@@ -42,7 +43,7 @@ Backend = Literal["auto", "llvm", "cuda"]
 # Fields that change how fast or where a sequence is made, never one byte of it.
 _NOT_CONTENT = {"backend", "faults"}
 # Sections that are left out where they are not set: sequences rendered before there were any stay the same.
-_LATER = ("target", "objects", "streams")
+_LATER = ("target", "objects", "streams", "stretch")
 # Sections of a sequence of two cameras, in place of which a rig has `streams`.
 _TWO_CAMERAS = ("color", "depth", "T_color_depth")
 # Fields that hold paths, by section.
@@ -64,6 +65,7 @@ class Config(Section):
     trajectory: TrajectoryConfig = TrajectoryConfig()
     motion: MotionConfig | None = None
     tremor: TremorConfig | None = None
+    stretch: StretchConfig | None = None
     scene: SceneConfig
     target: TargetConfig | None = None
     objects: tuple[ObjectConfig, ...] = Field(

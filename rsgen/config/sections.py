@@ -12,6 +12,7 @@ from rsgen.limits import MOST_M, RigidTransform, limits
 
 Coordinate = Annotated[float, limits(-MOST_M, MOST_M, "m")]
 Position = tuple[Coordinate, Coordinate, Coordinate]
+Angle = Annotated[float, limits(-180, 180, "degrees")]
 Row34 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Matrix34 = tuple[Row34, Row34, Row34]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -47,6 +48,21 @@ class TrajectoryConfig(Section):
     )
     smoothing: Annotated[float, limits(0, 1e6, "s^4: 1 damps all but motions slower than a second")] = Field(
         default=0.0, description="weight of the acceleration penalty of the fit, s^4"
+    )
+
+
+class StretchConfig(Section):
+    """A piece of the motion in place of all of it."""
+
+    start_s: Annotated[float, limits(0, 1e6, "s")] = Field(
+        default=0.0, description="where it begins, s after the motion's first pose; the sequence's time is 0 there"
+    )
+    duration_s: Annotated[float, limits(1e-3, 1e6, "s")] = Field(description="of the sequence, s")
+    speed: Annotated[float, limits(1e-3, 1e3, "times the motion's own")] = Field(
+        default=1.0, description="times the motion's own"
+    )
+    turn_deg: tuple[Angle, Angle, Angle] = Field(
+        default=(0.0, 0.0, 0.0), description="the body looks aside: rotation vector [pitch, yaw, roll], degrees"
     )
 
 

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+from rsgen.errors import UserError
 from rsgen.files import atomic_write
+from rsgen.sequence.format import STREAMS
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -26,6 +29,28 @@ def configs_folder() -> Path:
     """The folder of the configs; the scenes are beside it. Raises OSError if the user's cache cannot be written."""
     share = _PACKAGE / "share"
     return (_kept(share, user_cache()) if share.is_dir() else _PACKAGE.parent) / "configs"
+
+
+def scaled(path: Path, config: Mapping[str, Any], width: int) -> dict[str, Any]:
+    """Fields of a config that make its images so wide, the same view in fewer or more pixels.
+
+    Pixel centres are at whole numbers. Raises UserError: the config (of the file `path`) has no size.
+    """
+    out: dict[str, Any] = {}
+    for stream in STREAMS:
+        section = config.get(stream) or {}
+        try:
+            columns, rows = int(section["width"]), int(section["height"])
+            fx, fy, cx, cy = (float(value) for value in section["intrinsics"])
+        except (KeyError, TypeError, ValueError):
+            needed = "width, height and intrinsics [fx, fy, cx, cy] must be numbers to be scaled"
+            raise UserError(f"{path}: {stream}: {needed}") from None
+        height = max(1, round(rows * width / columns))
+        x, y = width / columns, height / rows
+        lens = (fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5)
+        out |= {f"{stream}.width": width, f"{stream}.height": height}
+        out[f"{stream}.intrinsics"] = [round(value, 9) for value in lens]
+    return out
 
 
 def user_cache() -> Path:

@@ -20,17 +20,18 @@ from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, read_yaml, write_error
 from rsgen.geometry.spline import Spline
-from rsgen.pack.draw import Drawn, PackOptions, draw_sequence
+from rsgen.motion.stretch import Drawn, draw_stretch
+from rsgen.pack.draw import PackOptions
 from rsgen.pack.pairs import (
-    LoadedScene,
+    Place,
     gyro_samples,
-    load_scene_and_light,
     mark_file,
     mean_twist,
     pair_files,
     render_pairs,
 )  # fmt: skip
-from rsgen.produce.parts import engine_versions, input_hashes, load_motion
+from rsgen.produce.batches import by_scene
+from rsgen.produce.parts import engine_versions, input_hashes, load_motion, load_scene_and_light
 from rsgen.produce.records import fingerprint
 from rsgen.sensors.imu import imu_csv
 
@@ -73,7 +74,7 @@ def make_pack(
     motions = [load_motion(config) for config in configs]
     spans = [(motion.first_stamp, motion.last_stamp) for motion in motions]
     rates = [config.color.rate_hz for config in configs]
-    drawn = [draw_sequence(options, seed, index, spans, rates) for index in range(options.sequences)]
+    drawn = [draw_stretch(options.ranges, seed, index, spans, rates) for index in range(options.sequences)]
     identities = [_identity(config) for config in configs]
     _open(out, identities, options, seed)
     jobs = []
@@ -86,34 +87,29 @@ def make_pack(
             config = config.model_copy(update={"scene": scene, "backend": variant.partition("_")[0]})
             jobs.append(PackJob(config, key, motions[one.config].spline, one, options, folder.resolve()))
     done = 0
-    # The first one of each scene alone: it bakes the light, if need be, and the others find it in the cache.
-    first = [next(k for k, job in enumerate(jobs) if job.key == key) for key in dict.fromkeys(job.key for job in jobs)]
-    rest = [job for k, job in enumerate(jobs) if k not in first]
-    # Scene by scene, so that each is loaded once.
-    for part in ([jobs[k] for k in first], sorted(rest, key=lambda job: job.key)):
-        for k, _ in workers.apply(make_sequence, part, progress):
-            done += 1
-            if not part[k].folder.is_dir():
-                raise UserError(f"{part[k].folder}: a worker has written it, but not here: choose an --out all share")
-            progress("sequences", done / len(jobs), f"{done * options.length} of {len(jobs) * options.length} pairs")
+    for job, _ in by_scene(make_sequence, jobs, workers, progress):
+        done += 1
+        if not job.folder.is_dir():
+            raise UserError(f"{job.folder}: a worker has written it, but not here: choose an --out all share")
+        progress("sequences", done / len(jobs), f"{done * options.length} of {len(jobs) * options.length} pairs")
     return PackSummary(out, options.sequences, options.sequences * options.length, done)
 
 
 def make_sequence(job: PackJob, progress: Progress) -> None:
     """Render one sequence into its folder, which is there when all of it is. Raises UserError."""
-    loaded = _loaded_scene(job, progress)
+    place = _loaded_scene(job, progress)
     temporary = job.folder.with_name(f".{job.folder.name}.{os.getpid()}.tmp")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
-        for k, pair in enumerate(render_pairs(loaded, job.drawn, job.options.length, job.options.depth)):
+        for k, pair in enumerate(render_pairs(place, job.drawn, job.options.length, job.options.depth)):
             for name, data in pair_files(job.options.layout, k, pair).items():
                 (temporary / name).write_bytes(data)
-        twist = mean_twist(loaded, job.drawn, job.options.length)
+        twist = mean_twist(place, job.drawn, job.options.length)
         name, text = mark_file(job.options.layout, job.drawn, twist, job.config.color.rate_hz)
-        samples = gyro_samples(loaded, job.drawn, job.options.length)
+        samples = gyro_samples(place, job.drawn, job.options.length)
         (temporary / GYRO).write_bytes(imu_csv(samples).encode())
-        (temporary / DRAWN).write_text(json.dumps(_about(job, loaded), indent=1) + "\n")
+        (temporary / DRAWN).write_text(json.dumps(_about(job, place), indent=1) + "\n")
         (temporary / name).write_bytes(text)
         os.replace(temporary, job.folder)  # noqa: PTH105 - one name for tests to break
     except OSError as error:
@@ -160,21 +156,21 @@ def _open(out: Path, identities: Sequence[dict[str, Any]], options: PackOptions,
 
 
 # Scene and light that this process rendered last, by what they were made from.
-_loaded: dict[str, LoadedScene] = {}
+_loaded: dict[str, Place] = {}
 
 
-def _loaded_scene(job: PackJob, progress: Progress) -> LoadedScene:
+def _loaded_scene(job: PackJob, progress: Progress) -> Place:
     if job.key not in _loaded:
         _loaded.clear()
-        _loaded[job.key] = load_scene_and_light(job.config, job.spline, progress)
+        _loaded[job.key] = Place(job.config, load_scene_and_light(job.config, progress), job.spline)
     return _loaded[job.key]
 
 
-def _about(job: PackJob, loaded: LoadedScene) -> dict[str, Any]:
+def _about(job: PackJob, place: Place) -> dict[str, Any]:
     """What was drawn, and the camera; times count from the first frame's stamp."""
-    color, drawn = loaded.config.color, job.drawn
+    color, drawn = place.config.color, job.drawn
     return {
-        "config": loaded.config.name, **dataclasses.asdict(drawn), "frames": job.options.length,
+        "config": place.config.name, **dataclasses.asdict(drawn), "frames": job.options.length,
         "rate_hz": color.rate_hz, "size": [color.width, color.height], "intrinsics": list(color.intrinsics),
         "model": color.model, "distortion": list(color.distortion), "scan": color.scan,
     }  # fmt: skip

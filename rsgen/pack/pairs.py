@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,12 +17,12 @@ import numpy as np
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.config import Config
 from rsgen.config.sections import GlobalTime, TruthConfig
-from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png
-from rsgen.pack.draw import Drawn, Layout, camera_spline
-from rsgen.produce.parts import load_scene, make_integrator
+from rsgen.motion.stretch import Drawn
+from rsgen.pack.draw import Layout, camera_spline
+from rsgen.produce.parts import LoadedScene
 from rsgen.sensors.color import apply_color_noise
 from rsgen.sensors.imu import ImuSamples, exact_imu
 from rsgen.sensors.seed import noise_generator
@@ -60,38 +59,28 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class LoadedScene:
-    """A config's scene and light, loaded, which sequences share; spline: T_world_depth(t) of its motion."""
+class Place:
+    """What sequences share: a config, its scene and light, loaded; spline: T_world_depth(t) of its motion."""
 
     config: Config
-    scene: Any
-    integrator: Any
+    loaded: LoadedScene
     spline: Spline
 
 
-def load_scene_and_light(config: Config, spline: Spline, progress: Progress = no_progress) -> LoadedScene:
-    """Load the scene and its light, baked now if no cache has it. Raises UserError."""
-    from rsgen.device.backend import mitsuba
-
-    mi = mitsuba(config.backend)
-    scene = load_scene(config)
-    return LoadedScene(config, scene, make_integrator(mi, scene, config, progress), spline)
-
-
-def render_pairs(loaded: LoadedScene, drawn: Drawn, length: int, depth: bool = False) -> Iterator[Pair]:
+def render_pairs(place: Place, drawn: Drawn, length: int, depth: bool = False) -> Iterator[Pair]:
     """The sequence's pairs, one after the other. depth: of the rolling images, too. Raises UserError."""
     from rsgen.render.images import ColorRenderer
     from rsgen.truth.renderer import TruthRenderer, global_instant
 
-    config = loaded.config
+    config = place.config
     color = config.color.model_copy(update={"readout_s": drawn.readout_s, "exposure_s": drawn.exposure_s})
     still = color.model_copy(update={"readout_s": 0.0, "exposure_s": 0.0})
     truth = TruthConfig(global_shutter=TIMES, flow=("global",), spp=config.truth.spp, color_depth=depth)
     camera, shutter = color.camera, color.shutter
-    rolling = ColorRenderer(loaded.scene, loaded.integrator, camera, shutter, color.spp)
-    twins = TruthRenderer(loaded.scene, loaded.integrator, color, truth)
-    back = TruthRenderer(loaded.scene, loaded.integrator, still, TruthConfig())
-    pose = camera_spline(loaded.spline, drawn, T_depth_color(config)).pose
+    rolling = ColorRenderer(place.loaded.scene, place.loaded.integrator, camera, shutter, color.spp)
+    twins = TruthRenderer(place.loaded.scene, place.loaded.integrator, color, truth)
+    back = TruthRenderer(place.loaded.scene, place.loaded.integrator, still, TruthConfig())
+    pose = camera_spline(place.spline, drawn, T_depth_color(config)).pose
     for k in range(length):
         stamp = k / color.rate_hz
         seed = int(np.random.SeedSequence([drawn.seed, k]).generate_state(1)[0])
@@ -111,25 +100,25 @@ def render_pairs(loaded: LoadedScene, drawn: Drawn, length: int, depth: bool = F
         )
 
 
-def gyro_samples(loaded: LoadedScene, drawn: Drawn, length: int) -> ImuSamples:
+def gyro_samples(place: Place, drawn: Drawn, length: int) -> ImuSamples:
     """Exact angular rate and specific force in the colour camera's frame, from the first stamp to the last line.
 
     Before that, EuRoC's format has no sign for times.
     """
-    color = loaded.config.color
+    color = place.config.color
     end = (length - 1) / color.rate_hz + drawn.readout_s
     t = np.arange(int(np.floor(end * _GYRO_HZ)) + 1) / _GYRO_HZ
-    gravity = _GRAVITY if loaded.config.imu is None else loaded.config.imu.gravity
-    spline = camera_spline(loaded.spline, drawn, T_depth_color(loaded.config))
+    gravity = _GRAVITY if place.config.imu is None else place.config.imu.gravity
+    spline = camera_spline(place.spline, drawn, T_depth_color(place.config))
     gyro, accel = exact_imu(spline, np.eye(4), gravity, t)
     return ImuSamples(t, gyro, accel, np.zeros_like(gyro), np.zeros_like(accel), stamps=t)
 
 
-def mean_twist(loaded: LoadedScene, drawn: Drawn, length: int) -> FloatArray:
+def mean_twist(place: Place, drawn: Drawn, length: int) -> FloatArray:
     """v, ω (6,) of the colour camera in its own frame, m/s and rad/s, averaged over the sequence's frames."""
-    color = loaded.config.color
+    color = place.config.color
     t = np.linspace(0.0, (length - 1) / color.rate_hz + drawn.readout_s, 64)
-    return np.asarray(camera_spline(loaded.spline, drawn, T_depth_color(loaded.config)).velocity(t).mean(axis=0))
+    return np.asarray(camera_spline(place.spline, drawn, T_depth_color(place.config)).velocity(t).mean(axis=0))
 
 
 def T_depth_color(config: Config) -> FloatArray:

@@ -18,6 +18,7 @@ from rsgen.motion.clearance import check_clearance
 from rsgen.motion.object_paths import check_objects_clear
 from rsgen.produce.frame_source import FrameSource, render_shots
 from rsgen.produce.parts import (
+    LoadedScene,
     TrueMotion,
     engine_versions,
     input_hashes,
@@ -39,11 +40,13 @@ ORIGIN = "origin.yaml"
 
 
 def render_sequence(
-    config: Config, out: Path, frames: slice, progress: Progress, workers: Workers | None = None
-) -> Path:
+    config: Config, out: Path, frames: slice, progress: Progress, workers: Workers | None = None,
+    loaded: LoadedScene | None = None,
+) -> Path:  # fmt: skip
     """Render the missing frames among `frames` into `out` and (re)write its listings and truth; returns `out`.
 
-    workers: what renders (and bakes the light) in place of this process; the bytes are the same.
+    workers: what renders (and bakes the light) in place of this process; the bytes are the same. loaded: its scene
+    and light, as `load_scene_and_light` returns them.
 
     Raises UserError on any bad input, or if `out` holds another sequence; nothing already written is lost.
     """
@@ -52,16 +55,16 @@ def render_sequence(
     if frames.start is not None and frames.start >= (longest := max(map(len, stamps.values()))):
         raise UserError(f"--frames: the sequence has no frame {frames.start}, only 0 to {longest - 1}")
     identity = engine_versions(config.backend), input_hashes(config)
-    meshes, scene = load_meshes(config.objects), None
+    meshes, scene = load_meshes(config.objects), loaded.scene if loaded else None
     # In a new folder: a scene that does not load must not leave one behind that its repaired self cannot continue.
     if not (out / "sequence.yaml").exists():
-        scene = load_scene(config)
+        scene = scene or load_scene(config)
         _check_ways(config, motion, meshes, scene)
     writer = SequenceWriter.open(out, config, motion.spline, stamps, *identity, motion.objects)
     write_origin(out, config)
     source = None
     for name in (name for name, camera in config.cameras.items() if camera.adapts):
-        source = source or open_frames(config, progress, scene=scene, objects=writer.objects)
+        source = source or open_frames(config, progress, scene=scene, objects=writer.objects, loaded=loaded)
         writer = writer.adapted(name, automatic_settings(name, source, writer, progress))
     todo = sorted((k, s) for s in config.cameras for k in _chosen(writer.missing(s), frames, len(stamps[s])))
     if not (out / "scene.ply").is_file():
@@ -78,7 +81,7 @@ def render_sequence(
 
             render_blocks(writer, todo, *identity, workers, progress)
         elif todo:
-            source = source or open_frames(config, progress, scene=scene, objects=writer.objects)
+            source = source or open_frames(config, progress, scene=scene, objects=writer.objects, loaded=loaded)
             render_shots(writer, source, todo, progress)
     except (KeyboardInterrupt, SystemExit):
         # A run that the user ends here leaves a readable, shorter sequence.

@@ -25,6 +25,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion, with_tremor
 from rsgen.motion.object_paths import object_spline
+from rsgen.motion.stretch import along, cut
 from rsgen.produce.camera_sources import Stage
 from rsgen.produce.frame_source import FrameSource
 from rsgen.produce.records import fingerprint
@@ -74,10 +75,35 @@ def load_motion(config: Config) -> TrueMotion:
         trajectory, spacing = with_tremor(recorded.spline, config.tremor, config.seed, trajectory.stamps[[0, -1]])
         smoothing = 0.0
     before, after = _padding(*config.cameras.values())
+    if config.stretch is not None:
+        return _stretch(config, trajectory, recorded, before, after, spacing, smoothing)
     fit = fit_spline(trajectory, dt=spacing, smoothing=smoothing, pad_begin_s=before, pad_end_s=after)
     first, last = float(trajectory.stamps[0]), float(trajectory.stamps[-1])
     objects = tuple(object_spline(thing, first, last, before, after) for thing in config.objects)
     return TrueMotion(fit.spline, recorded or fit, first, last, objects)
+
+
+def _stretch(
+    config: Config, trajectory: Trajectory, recorded: FitResult | None, before: float, after: float, spacing: float,
+    smoothing: float,
+) -> TrueMotion:  # fmt: skip
+    """The config's stretch of a trajectory, with `before` and `after` s (of its own time) beyond its ends."""
+    stretch = config.stretch
+    assert stretch is not None
+    speed, duration = stretch.speed, stretch.duration_s
+    first, last = (float(stamp) for stamp in trajectory.stamps[[0, -1]])
+    if stretch.start_s + speed * duration > last - first + 1e-9:
+        raise UserError(
+            f"stretch: {stretch.start_s:g} s and {duration:g} s at {speed:g} times the speed are more than the motion "
+            f"lasts, {last - first:g} s: begin earlier or make it shorter"
+        )
+    beyond = max(speed, 1.0)
+    fit = fit_spline(trajectory, dt=spacing, smoothing=smoothing, pad_begin_s=beyond * before, pad_end_s=beyond * after)
+    moved = along(fit.spline, first + stretch.start_s, speed, np.radians(stretch.turn_deg), np.eye(4))
+    # A little more than is needed: stamps are rounded.
+    begin, end = max(moved.t_begin, -before - moved.dt), min(moved.t_end, duration + after + moved.dt)
+    objects = tuple(object_spline(thing, 0.0, duration, before, after) for thing in config.objects)
+    return TrueMotion(cut(moved, begin, end), recorded or fit, 0.0, duration, objects)
 
 
 def sequence_stamps(config: Config, motion: TrueMotion) -> dict[str, FloatArray]:
@@ -203,19 +229,37 @@ def engine_versions(backend: Backend) -> dict[str, str]:
 # --- light and frames
 
 
+@dataclass(frozen=True)
+class LoadedScene:
+    """A config's scene and light, loaded, which sequences without objects share."""
+
+    scene: Any
+    integrator: Any
+
+
+def load_scene_and_light(config: Config, progress: Progress = no_progress) -> LoadedScene:
+    """Load the scene and its light, baked now if no cache has it. Raises UserError."""
+    from rsgen.device.backend import mitsuba
+
+    mi = mitsuba(config.backend)
+    scene = load_scene(config)
+    return LoadedScene(scene, make_integrator(mi, scene, config, progress))
+
+
 def open_frames(
     config: Config, progress: Progress = no_progress, global_shutter: bool = False, scene: Any = None,
-    objects: Sequence[Spline] = (),
+    objects: Sequence[Spline] = (), loaded: LoadedScene | None = None,
 ) -> FrameSource:  # fmt: skip
     """Load the scene, unless it is given, and its light (baked now if no cache has it). Raises UserError.
 
-    global_shutter: all lines of a frame at once. objects: T_world_object(t) of the config's, all of them.
+    global_shutter: all lines of a frame at once. objects: T_world_object(t) of the config's, all of them. loaded: by
+    `load_scene_and_light` for an equal scene, light and spp.
     """
     from rsgen.device.backend import mitsuba
 
     mi = mitsuba(config.backend)
-    scene = scene or load_scene(config)
-    integrator = make_integrator(mi, scene, config, progress, objects)
+    scene = loaded.scene if loaded else scene or load_scene(config)
+    integrator = loaded.integrator if loaded else make_integrator(mi, scene, config, progress, objects)
     things = integrator.objects if objects else None
     instances = scene_instances(scene, config) if config.truth.labels else None
     return FrameSource(Stage(scene, integrator, things, config.seed, global_shutter, instances), config)

@@ -12,12 +12,11 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from rsgen.console.configs import config_file
+from rsgen.console.configs import config_file, scaled
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_bytes, read_text, read_yaml
@@ -25,7 +24,6 @@ from rsgen.sequence.reader import read_sequence
 from rstrack.bench.definitions import SequenceEntry
 
 Render = Callable[[Sequence[str]], None]
-_STREAMS = ("color", "depth")
 
 
 class Absent(UserError):
@@ -112,28 +110,6 @@ class Sources:
 def default_cache() -> Path:
     """Where sequences are kept that are rendered for benchmarks: several gigabytes."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rolling-shutter-rgbd"
-
-
-def scaled(path: Path, config: Mapping[str, Any], width: int) -> dict[str, Any]:
-    """Fields of a config that make its images so wide, the same view in fewer or more pixels.
-
-    Pixel centres are at whole numbers. Raises UserError: the config (of the file `path`) has no size.
-    """
-    out: dict[str, Any] = {}
-    for stream in _STREAMS:
-        section = config.get(stream) or {}
-        try:
-            columns, rows = int(section["width"]), int(section["height"])
-            fx, fy, cx, cy = (float(value) for value in section["intrinsics"])
-        except (KeyError, TypeError, ValueError):
-            needed = "width, height and intrinsics [fx, fy, cx, cy] must be numbers to be scaled"
-            raise UserError(f"{path}: {stream}: {needed}") from None
-        height = max(1, round(rows * width / columns))
-        x, y = width / columns, height / rows
-        lens = (fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5)
-        out |= {f"{stream}.width": width, f"{stream}.height": height}
-        out[f"{stream}.intrinsics"] = [round(value, 9) for value in lens]
-    return out
 
 
 def run_rsgen(words: Sequence[str]) -> None:

@@ -13,10 +13,10 @@ import synthetic
 import yaml
 
 from rsgen.config.config import load_config
-from rsgen.console.configs import config_file
+from rsgen.console.configs import config_file, scaled
 from rsgen.errors import UserError
 from rstrack.bench.definitions import SequenceEntry
-from rstrack.bench.sequences import Absent, Sources, run_rsgen, scaled
+from rstrack.bench.sequences import Absent, Sources, run_rsgen
 
 
 class Renderer:

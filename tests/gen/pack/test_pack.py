@@ -16,7 +16,8 @@ from rsgen.config.config import Config, load_config
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
-from rsgen.pack.draw import Drawn, PackOptions, camera_spline, draw_sequence
+from rsgen.motion.stretch import Drawn, draw_stretch
+from rsgen.pack.draw import PackOptions, camera_spline
 from rsgen.pack.pairs import T_depth_color, flo_bytes, mark_file, pdepth_text
 from rsgen.produce.parts import load_motion
 
@@ -30,9 +31,9 @@ def spline() -> Spline:
 
 def test_a_draw_depends_on_seed_and_index_alone_and_keeps_to_its_ranges() -> None:
     options = PackOptions(count=300, length=5, readout=(0.01, 0.03), exposure=(0.002, 0.004), speed=(0.5, 2.0))
-    drawn = [draw_sequence(options, 7, k, SPAN, (30.0, 15.0)) for k in range(300)]
-    assert drawn[41] == draw_sequence(replace(options, count=42), 7, 41, SPAN, (30.0, 15.0))
-    assert drawn[41] != draw_sequence(options, 8, 41, SPAN, (30.0, 15.0))
+    drawn = [draw_stretch(options.ranges, 7, k, SPAN, (30.0, 15.0)) for k in range(300)]
+    assert drawn[41] == draw_stretch(replace(options, count=42).ranges, 7, 41, SPAN, (30.0, 15.0))
+    assert drawn[41] != draw_stretch(options.ranges, 8, 41, SPAN, (30.0, 15.0))
     assert {d.config for d in drawn} == {0, 1}
     for d in drawn:
         begin, end = SPAN[d.config]
@@ -70,9 +71,9 @@ def test_ranges_that_are_none_are_refused(change: dict[str, object], told: str) 
 
 def test_motions_too_short_and_readouts_too_long_are_refused() -> None:
     with pytest.raises(UserError, match=r"motion lasts 0\.01 s"):
-        draw_sequence(PackOptions(), 0, 0, [(0.0, 0.01)], [30.0])
+        draw_stretch(PackOptions().ranges, 0, 0, [(0.0, 0.01)], [30.0])
     with pytest.raises(UserError, match=r"longer than the 0\.01667 s between frames"):
-        draw_sequence(PackOptions(), 0, 0, [(0.0, 10.0)], [60.0])
+        draw_stretch(PackOptions().ranges, 0, 0, [(0.0, 10.0)], [60.0])
 
 
 def test_flow_files_are_middleburys() -> None:
