@@ -7,7 +7,7 @@ from typing import Annotated
 
 from rsgen.console.command_line import Quiet
 from rsgen.console.scheduler import Scheduler, open_workers
-from rsgen.suite.make import RenderOptions
+from rsgen.suite.options import RenderOptions
 
 SuiteName = Annotated[str | None, "of a suite that ships, or its YAML file (default: name those that ship)"]
 SuiteFolder = Annotated[Path, "folder that 'rsgen suite render' wrote, or a copy of it"]

@@ -12,7 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
 from rsgen.suite.definition import FORMAT, SUITE, Definition, Planned
 from rsgen.suite.listing import estimate
 from rsgen.suite.manifest import MANIFEST, FileRecord, read_manifest, record_files, rule_of, sha256_of, write_manifest
+from rsgen.suite.options import RenderOptions
 
 log = logging.getLogger("rsgen")
 
@@ -45,23 +46,6 @@ log = logging.getLogger("rsgen")
 _DONE = ".done"
 # What a tracker is given of a test sequence; a camera.yaml stands for its sequence.yaml.
 _INPUTS = ("rgb", "depth", "rgb.txt", "depth.txt", "associations.txt", "imu.csv", "camera.yaml")
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """What of a suite is rendered; each field's text is also the help of the option of its name."""
-
-    tier: Annotated[str | None, "only sequences of this tier (default: all)", "TIER"] = None
-    only: Annotated[
-        tuple[str, ...] | None, "only sequences whose name, group or role is this; * and ? allowed", "GLOB"
-    ] = None
-    data: Annotated[Path | None, "folder with recorded trajectories that do not ship, such as ICL-NUIM's", "DIR"] = None
-    hold_back_truth: Annotated[
-        Path | None, "put all of test sequences that gives their motion away into this folder instead", "DIR"
-    ] = None
-    test_seed: Annotated[int | None, "seeds of test sequences are drawn from this number: keep it to yourself", "N"] = (
-        None
-    )
 
 
 @dataclass(frozen=True)
