@@ -157,9 +157,9 @@ _WORTH = (-3.0, 0.0, 1.0, 1.0, 0.3, -0.3)
 _NOTHING = -5.0
 _SHAPE = 0.8
 _DETAIL = 2.5
-# A view without edges in colour is as bad as one whose surfaces are 60 cm away. A tenth of it burnt out is worse: the
-# whole tour is to be exposed for that then.
-_PLAIN, _BURNT, _EDGES = 2.0, 25.0, 0.05
+# A view without edges in colour is worth as little as one of what is too near; one with a quarter of them, as those of
+# furnished living rooms have, has enough. More burnt out than a fifth is worth as little as nothing.
+_PLAIN, _BURNT, _EDGES = 4.0, 25.0, 0.25
 _AHEAD = 0.7
 _CHANCE = 0.15
 _EASY_DEG = 30.0

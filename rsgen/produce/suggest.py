@@ -54,7 +54,8 @@ from rsgen.produce.views import (
     views_along,
 )
 
-_ATTEMPTS = 3
+# How much it counts, in one attempt after the other, that a view is burnt out: tours that shun windows may see little.
+_SHUNNED = (0.3, 0.0, 1.0)
 _CALM = (0.08, 0.2, 1.0, 4.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
@@ -160,8 +161,10 @@ def suggest_tour(
         raise scene.wrong(f"reaches {farthest:.0f} m from the origin: scale it to metres, or move it to the origin")
     rng = np.random.default_rng(wish.seed)
     best: tuple[Tour, Config] | None = None
-    for _ in range(_ATTEMPTS):
-        tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
+    for shunned in _SHUNNED:
+        tours = (
+            _through(scene, aim, wish, shunned, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
+        )
         config = _config(scene, tours, name, wish, like)
         spline = load_motion(config).spline
         least = clearance(spline, scene.triangles, max(REACH_M, wish.clearance_m))
@@ -209,13 +212,15 @@ def _merit(tour: Tour) -> tuple[bool, float]:
     return tour.flat <= _FLAT, tour.scores.worst + 0.3 * float(tour.scores.worth.mean())
 
 
-def _through(scene: TourScene, plan: FloorPlan, wish: Wish, rng: np.random.Generator) -> list[tuple[Waypoint, ...]]:
-    """Tours through a room along one walk, whose gaze is ever calmer."""
+def _through(
+    scene: TourScene, plan: FloorPlan, wish: Wish, shunned: float, rng: np.random.Generator
+) -> list[tuple[Waypoint, ...]]:
+    """Tours through a room along one walk, whose gaze is ever calmer. shunned: one of `_SHUNNED`."""
     p_world = walk_inside(plan, wish.seconds * wish.speed_m_s, wish.clearance_m, rng)
     if p_world is None:
         raise scene.wrong(f"no walk keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
     state = int(rng.integers(2**31))
-    color = plainness(p_world, scene.shine, AZIMUTHS, ELEVATIONS_DEG)
+    color = plainness(p_world, scene.shine, AZIMUTHS, ELEVATIONS_DEG) * np.reshape([1.0, shunned], (2, 1, 1, 1))
     return [
         _waypoints(*choose_targets(p_world, scene.cast, calm, np.random.default_rng(state), color)) for calm in _CALM
     ]
