@@ -70,6 +70,7 @@ def base_config(motion: dict[str, Any] | None = None) -> dict[str, Any]:
         | {"auto_exposure": {}, "auto_white_balance": {}},
         "depth": tiny.CAMERA | {"noise": {"model": "kinect"}},
         "tremor": {},
+        "stretch": {"duration_s": 0.1},
         "truth": TRUTH,
         "imu": {},
         "mocap": {},
