@@ -20,7 +20,7 @@ from rsgen.config.faults import FaultsConfig, as_declared, from_recorded, moved_
 from rsgen.config.imu import ImuConfig
 from rsgen.config.motion import MOST_OBJECTS, MotionConfig, ObjectConfig, TremorConfig, content_of
 from rsgen.config.presets import Preset, with_presets
-from rsgen.config.rig import RigStream, T_cam_body, check_stereo, with_left_cameras
+from rsgen.config.rig import RigColorConfig, RigStream, T_cam_body, check_stereo, with_left_cameras
 from rsgen.config.sections import (
     LightConfig,
     MocapConfig,
@@ -114,6 +114,8 @@ class Config(Section):
         faults = self.injected
         if not faults.declared is faults.color is faults.depth is None:
             raise ValueError("faults: of a rig can be those of the IMU only: remove the others, or streams")
+        if self.objects and any(isinstance(c, RigColorConfig) and c.dots is not None for c in self.streams.values()):
+            raise ValueError("objects: a projector's dots do not fall on what moves: remove the objects, or the dots")
         check_stereo(self.streams)
         return self
 

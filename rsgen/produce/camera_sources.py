@@ -104,7 +104,7 @@ class ColorSource:
         if isinstance(config, RigColorConfig) and config.dots is not None:
             from rsgen.sensors.dots import DotProjector
 
-            self._dots = DotProjector(stage.scene, config.camera, shutter, config.dots, stage.seed, stage.objects)
+            self._dots = DotProjector(stage.scene, config.camera, shutter, config.dots, stage.seed)
 
     def expose(
         self, spline: Spline, stamp: float, frame: int, next_stamp: float | None = None,

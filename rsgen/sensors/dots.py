@@ -16,7 +16,6 @@ from rsgen.config.rig import DotsConfig
 from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
 from rsgen.sensors.stereo import dot_pattern
 
@@ -28,12 +27,9 @@ _SIDE = 3  # rays of a pixel, squared: a dot is about as wide as one
 class DotProjector:
     """A pattern of dots, the same in every frame, that moves with the camera line by line."""
 
-    def __init__(
-        self, scene: Any, camera: Camera, shutter: Shutter, config: DotsConfig, seed: int,
-        objects: MovingObjects | None = None,
-    ) -> None:  # fmt: skip
-        """seed: of where the dots are. objects: that move."""
-        self._scene, self._objects, self._config = scene, objects, config
+    def __init__(self, scene: Any, camera: Camera, shutter: Shutter, config: DotsConfig, seed: int) -> None:
+        """seed: of where the dots are."""
+        self._scene, self._config = scene, config
         self._sensor = RollingShutterSensor(camera, shutter)
         self._middle = 0.5 * shutter.exposure_s
         half = np.tan(np.deg2rad(config.field_deg) / 2)

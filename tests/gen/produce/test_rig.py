@@ -29,6 +29,8 @@ from rstrack.data.dataset import open_dataset
 T_COLOR_DEPTH = se3.exp(np.array([-0.03, 0.01, 0.0, 0.01, -0.02, 0.03]))
 GREY = {**tiny.CAMERA, "kind": "infrared", "readout_s": 0.0, "spp": 4}
 NOISE = {"model": "camera"}
+BALL = {"name": "ball", "shape": {"kind": "sphere", "size_m": [0.3, 0.3, 0.3]},
+        "motion": {"kind": "circle", "position": [0, 0, 1.2], "radius_m": 0.1, "period_s": 4.0}}  # fmt: skip
 FRAMES = 3
 
 
@@ -230,6 +232,7 @@ def changed(name: str, **fields: Any) -> dict[str, Any]:
         ({"Left eye": STREAMS["left"]}, {}, "streams"),
         ({"truth": STREAMS["left"]}, {}, "choose another"),
         (STREAMS, {"color": {"width": 64}}, "a rig has its cameras in streams"),
+        (STREAMS, {"objects": [BALL]}, "dots do not fall on what moves"),
         (STREAMS, {"faults": {"color": {"offset_s": 0.01}}}, "can be those of the IMU only"),
     ],
 )  # fmt: skip
