@@ -125,7 +125,7 @@ def test_masks_and_depth_are_embrees_line_by_line(images: Any, reference: Any, r
     assert set(ids) == {0, 1, 2} and 0.2 < np.mean(ids > 0) < 0.8
     np.testing.assert_array_equal(ids, reference["number"])
     np.testing.assert_allclose(images["color_depth"].ravel(), reference["z"], atol=2e-5)
-    z, again = DepthRenderer(room, CAMERA, SHUTTER, MovingObjects(things)).cast(motion, STAMP)
+    z, again, _ = DepthRenderer(room, CAMERA, SHUTTER, MovingObjects(things)).cast(motion, STAMP)
     np.testing.assert_array_equal(z, images["color_depth"])
     np.testing.assert_array_equal(again, images["object_ids"])
     # The lines' own times matter: with all at one time, the things' outlines are elsewhere.

@@ -46,7 +46,7 @@ def test_names_in_another_case_and_with_backslashes(
     trimesh.creation.box((1, 2, 3)).export(folder / "meshes" / "box.ply")
     assert content_hash(scene) != hashed
     (folder / "meshes" / "BOX.ply").write_bytes(b"")
-    fails(scene, r"MESHES.*Box\.PLY' is missing")
+    fails(scene, r"MESHES.*Box\.PLY' that it names is missing")
 
 
 def test_the_name_itself_comes_first_and_only_what_is_clear_is_found(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def test_meshes_that_are_broken(tmp_path: Path, name: str, content: bytes, words
 def test_images_that_are_missing_or_broken(tmp_path: Path) -> None:
     image = '<texture type="bitmap" name="reflectance"><string name="filename" value="a.png"/></texture>'
     path = write_scene(tmp_path, f'<shape type="cube"><bsdf type="diffuse">{image}</bsdf></shape>')
-    fails(path, "file 'a.png' is missing: put it there, or mend its path")
+    fails(path, "file 'a.png' that it names is missing: put it there, mend its path")
     (tmp_path / "a.png").write_bytes(b"\x89PNG and no more")
     fails(path, "texture bitmap 'a.png'.*save the image anew")
 

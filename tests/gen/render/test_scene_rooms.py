@@ -288,7 +288,7 @@ def test_two_builds_are_equal_and_named_right(name: str, tmp_path: Path, monkeyp
     assert all((tmp_path / "a" / f).read_bytes() == (tmp_path / "b" / f).read_bytes() for f in files)
     root = ET.parse(xml).getroot()
     named = [e.get("value", "") for e in root.iter("string") if e.get("name") == "filename"]
-    assert {str(f) for f in files} == {*named, "scene.xml"}
+    assert {str(f) for f in files} == {*named, "scene.xml", "parts.csv"}
     ids = {e.get("id") for e in root.findall("bsdf")}
     assert {e.get("id") for e in root.iter("ref")} <= ids
     assert {e.get("type") for e in root.findall("bsdf")} <= {"twosided", "thindielectric"}

@@ -71,7 +71,7 @@ def test_record3d_without_its_unpacker_says_what_to_install(
     place: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "liblzfse", None)
-    refused(capfd, str(recordings.write_r3d(place / "one.r3d", CONTENT).name), "LZFSE", "[record3d]")
+    refused(capfd, str(recordings.write_r3d(place / "one.r3d", CONTENT).name), "LZFSE", "pip install", "pyliblzfse")
 
 
 @pytest.mark.parametrize("per_frame", [True, False])

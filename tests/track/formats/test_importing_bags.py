@@ -183,7 +183,7 @@ def test_bags_without_rosbags_say_what_to_install(
 ) -> None:
     recordings.write_realsense(place / "rs.bag", CONTENT)
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
-    refused(capfd, "rs.bag", "[ros]")
+    refused(capfd, "rs.bag", "pip install", "rosbags")
 
 
 @pytest.mark.parametrize(("name", "is_ros1", "storage"), [("packed.bag", True, "bz2"), ("two.mcap", False, "mcap")])
