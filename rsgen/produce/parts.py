@@ -266,8 +266,8 @@ def open_frames(
 
 
 def scene_instances(scene: Any, config: Config) -> Any:
-    """`rsgen.render.labels.Instances` of the config's loaded scene. Raises UserError."""
-    from rsgen.render.labels import find_instances
+    """`rsgen.truth.instances.Instances` of the config's loaded scene. Raises UserError."""
+    from rsgen.truth.instances import find_instances
 
     return find_instances(scene, config.scene.file, _options(config.scene))
 

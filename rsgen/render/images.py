@@ -17,7 +17,6 @@ from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.labels import Instances
 from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
 
@@ -131,9 +130,9 @@ class DepthRenderer:
 
     def __init__(
         self, scene: Any, camera: Camera, shutter: Shutter, objects: MovingObjects | None = None,
-        instances: Instances | None = None,
+        instances: Any = None,
     ) -> None:  # fmt: skip
-        """instances: of the scene, where labels are asked for."""
+        """instances: `rsgen.truth.instances.Instances` of the scene, where labels are asked for."""
         self._scene, self._instances = scene, instances
         self.sensor = RollingShutterSensor(camera, shutter)
         self._exposure = shutter.exposure_s

@@ -31,6 +31,8 @@ RULES = {
     "description": "the same but for versions, hashes of inputs and the fingerprint over both",
     "numbers": "the same text and shapes, numbers within 1e-8: a fit's last bits, or the last decimal",
     "depth": "metres within 0.1 mm in 99.9 % of pixels: at edges another surface may be seen",
+    "labels": "the same thing in 99 % of pixels",
+    "boxes": "made from labels, which are compared themselves",
     "sensor": "16-bit depth, the same within two units in 99 % of pixels",
     "image": "8 bits, PSNR 40 dB or more",
     "truth": "of 99 % of pixels within 0.001 of the channel's largest value",
@@ -53,6 +55,10 @@ def rule_of(path: Path) -> str:
     """The rule of a file of a sequence. Raises OSError."""
     if path.name == "sequence.yaml":
         return "description"
+    if path.name.startswith("boxes"):
+        return "boxes"
+    if path.parent.name in ("labels", "depth_labels"):
+        return "labels"
     if path.suffix == ".png":
         with path.open("rb") as file:
             return "sensor" if file.read(25)[-1:] == b"\x10" else "image"  # bits a channel
@@ -200,6 +206,14 @@ def _sensor(a: Path, b: Path) -> str | None:
     return _share(_png(a), _png(b), 2.0, 0.99, "two units")
 
 
+def _labels(a: Path, b: Path) -> str | None:
+    return _share(_png(a), _png(b), 0.0, 0.99, "the same thing")
+
+
+def _boxes(_: Path, __: Path) -> None:
+    return None
+
+
 def _depth(a: Path, b: Path) -> str | None:
     return _share(_exr(a), _exr(b), 1e-4, 0.999, "0.1 mm")
 
@@ -229,5 +243,5 @@ def _surface(a: Path, b: Path) -> str | None:
 
 _RULES: dict[str, Callable[[Path, Path], str | None]] = {
     "exact": _exact, "description": _description, "numbers": _numbers, "depth": _depth, "sensor": _sensor,
-    "image": _image, "truth": _truth, "surface": _surface,
+    "labels": _labels, "boxes": _boxes, "image": _image, "truth": _truth, "surface": _surface,
 }  # fmt: skip

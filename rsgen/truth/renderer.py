@@ -40,11 +40,11 @@ from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
-from rsgen.render.labels import Instances
 from rsgen.render.moving_objects import MovingObjects, ObjectsInFrame
 from rsgen.render.sensor import RollingShutterSensor
 from rsgen.sensors.color import to_srgb8
 from rsgen.sequence.format import LABELS_IMAGE, OBJECT_IDS
+from rsgen.truth.instances import Instances
 
 # Rays that ask whether a point is seen end this much short of it, as a fraction of their length: 0.1 mm at 1 m.
 _SHORT = 1e-4
