@@ -23,9 +23,11 @@ from rsgen.config.config import load_config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
+from rsgen.image_codecs import encode_png
 from rsgen.produce.generate import render_sequence
 from rsgen.suite.definition import Definition, read_definition, suites_folder
 from rsgen.suite.listing import estimate
+from rsgen.suite.manifest import compare, record_files
 
 ROOT = Path(__file__).parents[3]
 HEAD: dict[str, Any] = {"format": "rsgen-suite/1", "name": "Tiny", "version": "1.0", "license": "CC-BY-4.0",
@@ -335,3 +337,18 @@ def test_an_estimate_counts_the_images_that_will_be_there(definition: Path, made
     guess = estimate(one.config for one in planned)
     images = [path for path in made.rglob("*.png") if "truth" not in path.parts]
     assert guess.frames == len(images) and guess.seconds > 0
+
+
+def test_labels_match_by_the_thing_not_by_its_number(tmp_path: Path) -> None:
+    """A neighbouring id is another thing, though 16-bit depth would call two units alike."""
+    labels = np.full((20, 30), 7, np.uint16)
+    for name, image in (("a", labels), ("b", labels + np.uint16(1)), ("c", np.where(np.eye(20, 30) > 0, 8, 7))):
+        path = tmp_path / name / "truth/depth_labels/000000.png"
+        path.parent.mkdir(parents=True)
+        path.write_bytes(encode_png(image.astype(np.uint16)))
+    files = record_files(tmp_path / "a")
+    assert [record.match for record in files.values()] == ["labels"]
+    assert compare(tmp_path / "a", tmp_path / "a", files) == []
+    for other, share in (("b", "0.00 %"), ("c", "96.67 %")):
+        (fault,) = compare(tmp_path / "a", tmp_path / other, files)
+        assert share in fault and "the same thing" in fault
