@@ -43,9 +43,15 @@ class StereoConfig(Section):
     left: str = Field(description="camera whose pixels the depth image has")
     right: str = Field(description="the other one: the same lens, beside it along its x axis")
     disparities: int = Field(default=128, ge=16, le=1024, multiple_of=16, description="largest disparity, px")
-    block_px: int = Field(default=7, ge=1, le=21, description="size of the window that is compared, px, odd")
+    block_px: int = Field(default=7, ge=1, le=21, description="size of the window that is compared, px: odd")
     uniqueness_pct: int = Field(default=10, ge=0, le=100, description="by how much the best match must beat the rest")
     speckle_px: int = Field(default=100, ge=0, le=100_000, description="smaller islands of disparity are left out, px")
+
+    @model_validator(mode="after")
+    def _has_a_middle(self) -> StereoConfig:
+        if self.block_px % 2 == 0:
+            raise ValueError(f"block_px: {self.block_px} has no middle pixel: take an odd number")
+        return self
 
 
 class RigColorConfig(ColorConfig):
