@@ -30,7 +30,9 @@ def in_channels(light: Any, cosine: Any) -> Any:
     less by what comes at a glance, and by 6 % more by what comes straight.
     """
     gets_in = (1 - mi.fresnel(dr.clip(cosine, 0, 1), _ETA)[0]) / _GETS_IN
-    return mi.Vector4f(light.x, light.y, light.z, dr.mean(light) * gets_in)
+    # Not by dr.mean: it has the number of rays as a constant, and each number is another kernel to compile.
+    grey = (light.x + light.y + light.z) * (1 / 3)
+    return mi.Vector4f(light.x, light.y, light.z, grey * gets_in)
 
 
 def rotation(index: Any, dimension: Any) -> Any:
@@ -53,6 +55,7 @@ def about_normal(p, n, number, begin, count, dimension, light_along):
     number for lots) π times the radiance that comes along it: with pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
     """
     frame = mi.Frame3f(n)
+    dimension = dr.opaque(mi.UInt32, dimension)
     offset = mi.Point2f(rotation(number, dimension), rotation(number, dimension + 1))
     lobe = rotation(number, dimension + 2)
     i = dr.opaque(mi.UInt32, begin)

@@ -110,6 +110,7 @@ def distance_to_box(folder: Path, method: str) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.nightly
 def test_lines_have_poses_of_their_own_where_the_method_says_so(original: Path) -> None:
     ours, baseline = distance_to_box(original, "rs-pg"), distance_to_box(original, "baseline")
     assert np.median(ours) < 0.001 < np.median(baseline)

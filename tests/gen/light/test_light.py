@@ -21,6 +21,7 @@ from lit import (
     scene_of,
     silent,
 )
+from nightly import sampled
 from rendering import constant_twist, dr, mi
 
 from rsgen.config.config import LightConfig
@@ -114,7 +115,7 @@ def dark_room_with_a_skylight(folder: Path) -> list[str]:
     return [FLOOR, room, SKY]
 
 
-@pytest.mark.parametrize(("pane", "transmits"), [("", 1.0), ("mask", 0.6), ("mirror", 1.0)])
+@pytest.mark.parametrize(("pane", "transmits"), sampled([("", 1.0), ("mask", 0.6), ("mirror", 1.0)], 2))
 def test_a_sky_seen_through_a_hole_is_a_lamp_of_that_shape(tmp_path: Path, pane: str, transmits: float) -> None:
     """With a half-transparent pane in it, it is a dimmer one; with one in a mirror there are two."""
     elements = dark_room_with_a_skylight(tmp_path)
@@ -268,6 +269,7 @@ def test_baked_light_agrees_with_the_path_tracer(tmp_path: Path) -> None:
     assert few[ball].mean(axis=0) == pytest.approx(every[ball].mean(axis=0), rel=0.02)
 
 
+@pytest.mark.nightly
 def test_a_glossy_floor_in_a_dim_mirror_is_what_stands_behind_it_dimmed(tmp_path: Path) -> None:
     """The mirror's image is the view of the mirrored camera, flipped, times the reflectance."""
     floor = """<shape type="rectangle"><transform name="to_world"><scale value="4"/></transform>

@@ -41,6 +41,7 @@ def floor_light(folder: Path, scene: Any) -> np.ndarray:
     return lookup(scene, field, XYZ, -UP)[1]
 
 
+@pytest.mark.nightly
 def test_a_lamp_in_bulbs_shines_as_if_these_did_nothing_but_colour_it(tmp_path: Path) -> None:
     """And afterwards they are glass again. A path tracer finds as much light on the floor, but for what a small bulb's
     glass holds back at first and the filament takes.

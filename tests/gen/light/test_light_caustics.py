@@ -109,6 +109,7 @@ def test_a_lamp_in_lacquer_lights_the_floor_by_fresnels_formula(tmp_path: Path) 
     assert np.quantile(np.abs(ratio - 1), 0.9) < 0.12
 
 
+@pytest.mark.nightly
 def test_what_stands_behind_a_board_takes_no_light_from_it(tmp_path: Path) -> None:
     """Of light that lands a board's own surface gets it all, not one of the same facing that it hides."""
     board = """<shape type="rectangle"><transform name="to_world"><scale x="0.3" y="0.3"/><translate x="0.3" z="0.015"/>
@@ -187,6 +188,7 @@ def test_bounces_go_on_in_a_white_room_beside_a_bright_street(tmp_path: Path) ->
     assert np.abs(got.mean(axis=0) / (np.pi * glow / (1 - albedo)) - 1).max() < 0.01
 
 
+@pytest.mark.nightly
 def test_a_lacquered_floor_in_brushed_metal_shows_what_it_mirrors(tmp_path: Path) -> None:
     """The path tracer's picture of it: the floor, dark, in a lamp's light, mirrors a dark wall, not the lamp."""
     floor = f'<shape type="rectangle">{SATIN.replace("0.2", "0.1")}</shape>'

@@ -77,6 +77,7 @@ def test_the_estimate_knows_of_lacquer(tmp_path: Path) -> None:
     assert estimated_quality(scene, field, 0.1, *view).psnr_db > 40
 
 
+@pytest.mark.nightly
 def test_lacquer_in_lacquer_shows_the_sky(tmp_path: Path) -> None:
     """Two black boards of satin: the sky gets to the eye by both or not at all."""
     floor, wall = (
@@ -122,6 +123,7 @@ def test_samples_of_a_pixel_spread_evenly_over_a_lobe(tmp_path: Path) -> None:
     assert means[0].std() < 0.65 * means[1].std()
 
 
+@pytest.mark.nightly
 def test_rough_metal_seen_from_behind_in_a_glossy_floor_is_dark_and_a_number(tmp_path: Path) -> None:
     """Regression: one-sided, Beckmann's, Mitsuba 3.9 samples it to no direction and a density of NaN."""
     metal = '<bsdf type="roughconductor"><float name="alpha" value="0.1"/></bsdf>'

@@ -35,6 +35,7 @@ from rstrack.data.timing import Timing, stream_timing
 pytestmark = pytest.mark.usefixtures("few_pairs")
 
 
+@pytest.mark.nightly
 def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> None:
     upward = recording(tmp_path / "seq", shaking(), scan="bottom-top")
     found = calibrate(told(upward, 0.004, 0.0, np.zeros(6)), frames=SHORT, options=OPTIONS)

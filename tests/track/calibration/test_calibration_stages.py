@@ -51,6 +51,7 @@ def uneven(dataset: Dataset, sigma: float) -> Dataset:
     return replace(dataset, images=UnevenDepth(dataset.images), rig=told)
 
 
+@pytest.mark.nightly
 def test_a_lens_is_not_bent_by_depth_that_is_off_in_the_same_way_in_all_images(shaken: Dataset) -> None:
     true = shaken.rig.color_camera
     errors = []

@@ -82,21 +82,39 @@ def test_without_loops_a_track_stays_as_it_is(dataset: Dataset, run: Path, tmp_p
 
 
 def test_ctrl_c_while_loops_are_closed_leaves_the_track(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop_closing, "closed", interrupted)
+    # Nobody says here that the lens is even: the run finds how even it is, and goes on with what it found.
+    dataset = replace(dataset, rig=replace(dataset.rig, color_falloff=None))
+    result = track(dataset, OPTIONS, tmp_path / "run", noise=NOISE)
+    assert result.end == "interrupted"
+    online, info = (tmp_path / "run" / "trajectory.txt").read_bytes(), tmp_path / "run" / "run.json"
+    falloff = json.loads(info.read_text())["dataset"]["color_falloff"]
+    # Where it was interrupted it goes on: nothing is left but the loops.
+    monkeypatch.undo()
+    again = track(dataset, OPTIONS, tmp_path / "run", noise=NOISE, resume=True)
+    assert again.end == "done"
+    assert (tmp_path / "run" / "trajectory_online.txt").read_bytes() == online
+    assert (tmp_path / "run" / "trajectory.txt").read_bytes() != online
+    assert json.loads(info.read_text())["dataset"]["color_falloff"] == falloff
+    assert json.loads(info.read_text())["loops"]["count"] >= 5
+
+
+def test_ctrl_c_while_loops_are_closed_changes_nothing(
     dataset: Dataset, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(loop_closing, "closed", interrupted)
-    # Nobody says here that the lens is even: both parts of the run find that themselves.
-    dataset = replace(dataset, rig=replace(dataset.rig, color_falloff=None))
-    result = track(dataset, OPTIONS, tmp_path / "run", noise=NOISE)
-    assert result.end == "interrupted"
+    assert track(dataset, OPTIONS, tmp_path / "run", noise=NOISE).end == "interrupted"
     assert (tmp_path / "run" / "trajectory.txt").read_bytes() == (run / "trajectory_online.txt").read_bytes()
-    # Where it was interrupted it goes on: nothing is left but the loops.
     monkeypatch.undo()
-    again = track(dataset, OPTIONS, tmp_path / "run", noise=NOISE, resume=True)
-    assert again.end == "done"
+    assert track(dataset, OPTIONS, tmp_path / "run", noise=NOISE, resume=True).end == "done"
     assert (tmp_path / "run" / "trajectory.txt").read_bytes() == (run / "trajectory.txt").read_bytes()
 
 
