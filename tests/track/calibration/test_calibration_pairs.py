@@ -7,6 +7,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 import pytest
+from nightly import sampled
 from shaken_recording import OPTIONS, bent
 
 from rsgen.device.arrays import engine
@@ -17,15 +18,17 @@ from rstrack.calibration.pairs.chain import PairSums, add_system, without_bright
 from rstrack.calibration.pairs.images import LinePoses, lines_of
 from rstrack.calibration.pairs.terms import PairTerms, pair_terms
 from rstrack.calibration.pairs.window import partners
-from rstrack.calibration.parameters import COUNT
+from rstrack.calibration.parameters import COUNT, NAMES
 from rstrack.calibration.run import parameters_of
 from rstrack.calibration.start import load_window
 from rstrack.data.dataset import Dataset
 
+# A few columns of every kind: all of them take seconds to compile, for each of ten kernels.
+FREE = np.isin(NAMES, ("depth.fx", "depth.cx", "depth.k1", "color.fx", "color.cx", "color.k1", "depth.error.offset_m"))
 APART = np.array([[1, 0], [2, 3], [0, 7], [7, 4], [5, 6]])
 
 
-@pytest.mark.parametrize("scan", ["top-bottom", "left-right"])
+@pytest.mark.parametrize("scan", sampled(["top-bottom", "left-right"], 2))
 def test_pairs_at_once_sum_to_the_same_as_one_by_one(
     shaken: Dataset, monkeypatch: pytest.MonkeyPatch, scan: str
 ) -> None:
@@ -33,7 +36,7 @@ def test_pairs_at_once_sum_to_the_same_as_one_by_one(
     rig = shaken.rig
     shutters = {name: replace(getattr(rig, name), scan=scan) for name in ("depth_shutter", "color_shutter")}
     dataset = bent(replace(shaken, rig=replace(rig, **shutters)))
-    terms, p = pair_terms(engine("llvm"), dataset, np.ones(COUNT, bool)), parameters_of(dataset)
+    terms, p = pair_terms(engine("llvm"), dataset, FREE), parameters_of(dataset)
     assert shaken.truth is not None
     window = load_window(terms, dataset, range(4, 12), shaken.truth, p, OPTIONS)
     base, lever = window.base(p)
