@@ -19,24 +19,27 @@ _BYTES_PER_COLOR, _BYTES_PER_DEPTH, _BYTES_PER_LINE, _BYTES_OF_SCENE = 1.7, 4.1,
 
 @dataclass(frozen=True)
 class Estimate:
-    """What sequences take: frames of all cameras, s of rendering on two cores, bytes; light comes on top."""
+    """What sequences take: frames of all cameras, s of rendering on two cores, bytes; bakes of light come on top."""
 
     frames: int
     seconds: float
     bytes: float
+    bakes: int
 
     def text(self) -> str:
         """In one line."""
         hours, gigabytes = self.seconds / 3600, self.bytes / 1e9
         took = f"{hours:.1f} h" if hours >= 1 else f"{self.seconds / 60:.0f} min"
-        return f"{self.frames} images, about {gigabytes:.2g} GB and {took} of rendering"
+        light = f"{self.bakes} bakes of light, minutes each" if self.bakes != 1 else "a bake of light, minutes"
+        return f"{self.frames} images, about {gigabytes:.2g} GB and {took} of rendering, and {light}"
 
 
 def estimate(configs: Iterable[Config]) -> Estimate:
     """By the number of pixels and samples alone: other scenes and machines differ by a factor of two or three."""
-    frames, seconds, size = 0, 0.0, 0.0
+    frames, seconds, size, baked = 0, 0.0, 0.0, set()
     for config in configs:
         lasts, size = _duration(config), size + _BYTES_OF_SCENE
+        baked.add(f"{config.scene} {config.light}")
         for camera in config.cameras.values():
             count, pixels = int((lasts - camera.offset_s) * camera.rate_hz + 1e-6) + 1, camera.width * camera.height
             frames, size = frames + count, size + count * camera.height * _BYTES_PER_LINE
@@ -47,7 +50,7 @@ def estimate(configs: Iterable[Config]) -> Estimate:
             else:
                 seconds += count * pixels * _S_PER_DEPTH
                 size += count * pixels * _BYTES_PER_DEPTH
-    return Estimate(frames, seconds, size)
+    return Estimate(frames, seconds, size, len(baked))
 
 
 def _duration(config: Config) -> float:
@@ -70,7 +73,7 @@ def describe_suite(suite: Definition) -> str:
         blocks.append(Table((f"tier {tier}", "role", "group", "config", "length"), rows, words=(0, 1, 2, 3, 4)).text())
         planned, skipped = suite.planned(tier, (), None, None)
         without = f", without {len(skipped)} that need --data" if skipped else ""
-        blocks.append(f"{len(planned)} sequences: {estimate(p.config for p in planned).text()}, and light{without}")
+        blocks.append(f"{len(planned)} sequences: {estimate(p.config for p in planned).text()}{without}")
     return "\n".join(blocks)
 
 

@@ -97,7 +97,7 @@ def render_suite(
         if job not in todo:
             _hold_back(job)
     guess = estimate(job.planned.config for job in todo)
-    log.info("%d of %d sequences to render: %s, and light", len(todo), len(jobs), guess.text())
+    log.info("%d of %d sequences to render: %s", len(todo), len(jobs), guess.text())
     begun, done, behind = time.monotonic(), 0, 0.0
     whole = max(guess.seconds, 1e-9)
     for job, _ in by_scene(make_sequence, todo, workers, progress):
@@ -105,8 +105,8 @@ def render_suite(
             raise UserError(f"{job.folder}: a worker has written it, but not here: choose an --out all share")
         done, behind = done + 1, behind + estimate([job.planned.config]).seconds
         took = time.monotonic() - begun
-        left = took * (whole / max(behind, 1e-9) - 1)
-        progress("sequences", behind / whole, f"{done} of {len(todo)}, {left / 3600:.2f} h left as measured")
+        left = took * max(0.0, whole / max(behind, 1e-9) - 1)
+        progress("sequences", min(1.0, behind / whole), f"{done} of {len(todo)}, {left / 3600:.2f} h left as measured")
     files = _finish(out, suite, truth)
     shutil.rmtree(out / _DONE)
     size = sum(record.size for record in files.values())
