@@ -24,7 +24,8 @@ _BY_READOUT = ("ate_mm", "drift_mm_s")
 _ABOUT = (
     "Means over all sequences of the tier. A method has one only where it is scored on every one of them; what is "
     "missing, lost (fewer than half of the frames have a pose) or failed is counted in the last column and named "
-    "below. Errors of a line need a spline, NEES needs covariances. Green: the best. Click a heading to sort."
+    "below. Errors of a line need splines, and are over the sequences whose truth is one; NEES needs covariances. "
+    "Green: the best. Click a heading to sort."
 )
 _OWN = (
     "To add a method: track the sequences with it, put its poses at METHOD/SEQUENCE.txt (TUM: stamp tx ty tz qx qy qz "

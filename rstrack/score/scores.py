@@ -19,6 +19,7 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
+from rsgen.geometry.spline import Spline
 from rsgen.sequence.images import Sequence as RsgenSequence
 from rstrack.bench.measures.track import consistency_of, errors_of
 from rstrack.bench.record import Figures, counts
@@ -35,6 +36,7 @@ FIGURES = (
     "ate_mm", "drift_mm_s", "drift_deg_s", "line_mm", "line_deg", "tracked_pct", "nees", "nees_first", "median_ms",
 )  # fmt: skip
 """What is shown, by the names of `rstrack.bench.figures`, and averaged over a tier."""
+_OF_LINES = ("line_mm", "line_deg")
 # What a track that is lost still has.
 _OF_ANY_TRACK = ("tracked_pct", "median_ms", "p95_ms")
 
@@ -43,12 +45,16 @@ Status = Literal["scored", "lost", "missing", "failed"]
 
 @dataclass(frozen=True)
 class SequenceScored:
-    """A sequence of the suite. readout_ms: of colour; None with `problem`, why nothing can be scored on it."""
+    """A sequence of the suite. readout_ms: of colour; None with `problem`, why nothing can be scored on it.
+
+    has_lines: its truth is a spline, which the stamps of some real cameras rule out.
+    """
 
     entry: SuiteEntry
     frames: int = 0
     readout_ms: float | None = None
     problem: str = ""
+    has_lines: bool = True
 
 
 @dataclass(frozen=True)
@@ -88,10 +94,15 @@ class Scores:
         return [e.name for e in self.suite.tier(tier) if self.of(e.name, method).status == status]
 
     def mean(self, tier: str, method: str, name: str) -> float | None:
-        """Of a figure over a whole tier: None if one of its sequences has none, whatever the reason."""
-        values = [self.of(entry.name, method).value(name) for entry in self.suite.tier(tier)]
+        """Of a figure over a whole tier: None if one of its sequences has none, whatever the reason.
+
+        Errors of lines are over those sequences whose truth is a spline.
+        """
+        poses_only = {s.entry.name for s in self.sequences if not s.problem and not s.has_lines}
+        entries = [e for e in self.suite.tier(tier) if name not in _OF_LINES or e.name not in poses_only]
+        values = [self.of(entry.name, method).value(name) for entry in entries]
         known = [value for value in values if value is not None]
-        return math.fsum(known) / len(known) if len(known) == len(values) else None
+        return math.fsum(known) / len(known) if known and len(known) == len(values) else None
 
     @property
     def gaps(self) -> list[str]:
@@ -214,7 +225,8 @@ def _opened(path: Path, entry: SuiteEntry) -> tuple[SequenceScored, Dataset | No
     problem = "has no ground truth here" if truth is None else ""
     # Poses of a truth are looked up between its stamps: a colour camera's need not be a depth frame's.
     truth = truth and replace(truth, interpolate=True)
-    return SequenceScored(entry, len(dataset), 1e3 * shutter.readout_s, problem), dataset, truth
+    has_lines = truth is not None and isinstance(truth.motion, Spline)
+    return SequenceScored(entry, len(dataset), 1e3 * shutter.readout_s, problem, has_lines), dataset, truth
 
 
 def _nees_first(truth: Truth, estimate: Estimate, result: Result, T_given_depth: FloatArray, about: About) -> Figures:

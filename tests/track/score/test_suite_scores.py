@@ -229,11 +229,13 @@ def test_a_suite_is_its_file_or_the_folders_that_are_there(suite: Path, tmp_path
 
 def made_up() -> Scores:
     entries = tuple(SuiteEntry(name=name, tier="small", group="ladder") for name in "ab")
-    sequences = tuple(SequenceScored(entry, 10, ms) for entry, ms in zip(entries, (0.0, 28.0), strict=True))
+    sequences = tuple(
+        SequenceScored(entry, 10, ms, has_lines=ms > 0) for entry, ms in zip(entries, (0.0, 28.0), strict=True)
+    )
     methods = tuple(MethodResults(key, About(url=f"https://{key}.org", note="<i>")) for key in ("good", "half"))
     scores = {
         ("a", "good"): Score("scored", figures={"ate_mm": 1.0, "tracked_pct": 100.0, "nees": 4.0}),
-        ("b", "good"): Score("scored", figures={"ate_mm": 4.0, "tracked_pct": 90.0, "nees": None}),
+        ("b", "good"): Score("scored", figures={"ate_mm": 4.0, "tracked_pct": 90.0, "nees": None, "line_mm": 3.0}),
         ("a", "half"): Score("scored", figures={"ate_mm": 0.5, "tracked_pct": 100.0}),
         ("b", "half"): Score("lost", "2 of 10 frames have a pose", {"ate_mm": 0.1, "tracked_pct": 20.0}),
     }
@@ -245,6 +247,8 @@ def test_a_mean_is_of_a_whole_tier_or_there_is_none() -> None:
     good, half = (data["means"]["small"][key] for key in ("good", "half"))
     assert (good["ate_mm"], good["tracked_pct"], good["nees"]) == (2.5, 95.0, None)
     assert (good["scored"], good["lost"]) == (["a", "b"], [])
+    # Of the first the truth has no lines; of the second the other method's track is lost.
+    assert good["line_mm"] == 3.0 and half["line_mm"] is None and good["line_deg"] is None
     assert (half["ate_mm"], half["tracked_pct"]) == (None, 60.0)
     assert (half["scored"], half["lost"]) == (["a"], ["b"])
     assert data["gaps"] == ["half, b: 2 of 10 frames have a pose"]
