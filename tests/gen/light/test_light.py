@@ -322,3 +322,22 @@ def test_a_sample_beside_a_lamp_brings_nothing(tmp_path: Path) -> None:
     points = SamplePoints(position, normal, normal, np.zeros(2, int))
     found = _draw(scene, None, 0, points, np.arange(2), False)(np.arange(2), 0, 8, silent)
     np.testing.assert_array_equal(found, np.zeros((2, 2, CHANNELS)))
+
+
+def test_a_kernel_of_light_serves_any_number_of_points_and_any_bounce() -> None:
+    """Neither is a constant of the program: compiling takes longer than all else in a small scene."""
+
+    def kernels(count: int, begin: int, dimension: int) -> set[int]:
+        p, n = dr.zeros(mi.Point3f, count), dr.zeros(mi.Vector3f, count)
+        n.z = 1
+        dr.eval(p, n)
+        dr.kernel_history_clear()
+        even, odd = about_normal(
+            p, n, dr.arange(mi.UInt32, count), begin, 4, dimension, lambda ray, i, pick: mi.Color3f(1) * pick
+        )
+        dr.eval(even, odd)
+        return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT]) if entry["operation_count"] > 50}
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        few = kernels(100, 0, 3)
+        assert len(few) == 1 and kernels(3000, 8, 9) == few
