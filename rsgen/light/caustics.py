@@ -131,8 +131,7 @@ def _thrown(scene: Any, si: Any, which: IntArray, area: float, follow: bool) -> 
     number = mi.UInt32(aligned(which, np.uint32))
 
     def drawn(dimension: int) -> Any:
-        first = dr.opaque(mi.UInt32, 310 + 2 * dimension)
-        return mi.Point2f(rotation(number, first), rotation(number, first + 1))
+        return mi.Point2f(rotation(number, 310 + 2 * dimension), rotation(number, 311 + 2 * dimension))
 
     ds, value = scene.sample_emitter_direction(si, drawn(0), False)
     cosine = dr.abs(dr.dot(si.sh_frame.n, ds.d))

@@ -164,9 +164,8 @@ def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follo
     it.p = p
     it.t = mi.Float(1)
     it.n = mi.Normal3f(n)
-    # Neither is part of the program: what is compiled for one lamp serves for all.
-    first_dimension = dr.opaque(mi.UInt32, 2 * dimension)
-    offset = mi.Point2f(rotation(number, first_dimension), rotation(number, first_dimension + 1))
+    offset = mi.Point2f(rotation(number, 2 * dimension), rotation(number, 2 * dimension + 1))
+    # Not part of the program: what is compiled for one lamp serves for all.
     lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else _registry_id(emitter)))
     i = dr.opaque(mi.UInt32, begin)
     end = i + dr.opaque(mi.UInt32, samples)

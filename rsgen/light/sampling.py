@@ -35,9 +35,9 @@ def in_channels(light: Any, cosine: Any) -> Any:
     return mi.Vector4f(light.x, light.y, light.z, grey * gets_in)
 
 
-def rotation(index: Any, dimension: Any) -> Any:
-    """Uniform offset in [0, 1) from a hash of a point's number and a dimension."""
-    return mi.sample_tea_float32(index, mi.UInt32(dimension), 4)
+def rotation(index: Any, dimension: int) -> Any:
+    """Uniform offset in [0, 1) from a hash of a point's number and a dimension, which is no part of the program."""
+    return mi.sample_tea_float32(index, dr.opaque(mi.UInt32, dimension), 4)
 
 
 def r2(i: Any, offset: Any) -> Any:
@@ -55,7 +55,6 @@ def about_normal(p, n, number, begin, count, dimension, light_along):
     number for lots) π times the radiance that comes along it: with pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
     """
     frame = mi.Frame3f(n)
-    dimension = dr.opaque(mi.UInt32, dimension)
     offset = mi.Point2f(rotation(number, dimension), rotation(number, dimension + 1))
     lobe = rotation(number, dimension + 2)
     i = dr.opaque(mi.UInt32, begin)

@@ -23,7 +23,7 @@ from rstrack.calibration.run import parameters_of
 from rstrack.calibration.start import load_window
 from rstrack.data.dataset import Dataset
 
-# A few columns of every kind: all of them take seconds to compile, for each of ten kernels.
+# A few columns of every kind: a kernel with all of them takes seconds to compile.
 FREE = np.isin(NAMES, ("depth.fx", "depth.cx", "depth.k1", "color.fx", "color.cx", "color.k1", "depth.error.offset_m"))
 APART = np.array([[1, 0], [2, 3], [0, 7], [7, 4], [5, 6]])
 

@@ -47,6 +47,10 @@ def tracker(to_and_fro: Dataset) -> Tracker:
     return tracker
 
 
+def interrupted(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
 def ate(run: Path, name: str = "metrics") -> float:
     return float(json.loads((run / "run.json").read_text())[name]["ate_rmse_m"])
 
@@ -84,9 +88,6 @@ def test_without_loops_a_track_stays_as_it_is(dataset: Dataset, run: Path, tmp_p
 def test_ctrl_c_while_loops_are_closed_leaves_the_track(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: Any) -> None:
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(loop_closing, "closed", interrupted)
     # Nobody says here that the lens is even: the run finds how even it is, and goes on with what it found.
     dataset = replace(dataset, rig=replace(dataset.rig, color_falloff=None))
@@ -107,9 +108,6 @@ def test_ctrl_c_while_loops_are_closed_leaves_the_track(
 def test_ctrl_c_while_loops_are_closed_changes_nothing(
     dataset: Dataset, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*_: Any) -> None:
-        raise KeyboardInterrupt
-
     monkeypatch.setattr(loop_closing, "closed", interrupted)
     assert track(dataset, OPTIONS, tmp_path / "run", noise=NOISE).end == "interrupted"
     assert (tmp_path / "run" / "trajectory.txt").read_bytes() == (run / "trajectory_online.txt").read_bytes()
