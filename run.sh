@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Set-up and the two commands of this project: ./run.sh demo, ./run.sh test (and ./run.sh setup alone, and for who
 # changes it ./run.sh bench smoke|gate|full and ./run.sh next).
-# Installs into .venv, and a libLLVM (16 or newer) from the system's packages if there is none. A second run is quick.
+# Installs into .venv, and a libLLVM (17 or newer) from the system's packages if there is none. A second run is quick.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -53,7 +53,7 @@ setup() {
   fi
   if ! .venv/bin/python -m rsgen.device.backend >/dev/null 2>&1; then
     say "installing libLLVM from the system's packages"
-    apt_install libllvm19 libllvm20 libllvm18 libllvm17 libllvm16 || true
+    apt_install libllvm19 libllvm20 libllvm18 libllvm17 || true
     .venv/bin/python -m rsgen.device.backend >/dev/null || exit 2
   fi
 }

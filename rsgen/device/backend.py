@@ -1,8 +1,9 @@
 """Choose Dr.Jit's backend once, before anything imports Dr.Jit or Mitsuba.
 
-Dr.Jit loads libLLVM at run time from wherever it finds one first. LLVM 14 and older it refuses, and LLVM 15 aborts the
-whole process on AVX-512 machines ("Cannot select: fminimum"), so a version of at least 16 is picked here by its own
-word (`LLVMGetVersion`) and handed over in `DRJIT_LIBLLVM_PATH`. LLVM 19 comes first: it was the fastest measured.
+Dr.Jit loads libLLVM at run time from wherever it finds one first. LLVM 14 and older it refuses, and LLVM 15 and 16
+abort the whole process on AVX-512 machines ("Cannot select: fminimum"), so a version of at least 17 is picked here by
+its own word (`LLVMGetVersion`) and handed over in `DRJIT_LIBLLVM_PATH`. LLVM 19 comes first: it was the fastest
+measured.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from rsgen.errors import UserError
 Backend = Literal["auto", "llvm", "cuda"]
 VARIANTS = {"llvm": "llvm_ad_rgb", "cuda": "cuda_ad_rgb"}
 
-MINIMUM_LLVM = 16
+MINIMUM_LLVM = 17
 PREFERRED_LLVM = 19
 _SEARCH = (
     "/usr/lib/*-linux-gnu/libLLVM*.so*",
@@ -31,7 +32,7 @@ _SEARCH = (
     "/usr/local/opt/llvm*/lib/libLLVM*.dylib",
 )
 _NO_LLVM = (
-    "no libLLVM of version 16 or newer was found: install one (Debian/Ubuntu: 'sudo apt-get install libllvm19', "
+    "no libLLVM of version 17 or newer was found: install one (Debian/Ubuntu: 'sudo apt-get install libllvm19', "
     "Fedora: 'sudo dnf install llvm-libs', macOS: 'brew install llvm'), or name it in DRJIT_LIBLLVM_PATH"
 )
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nightly import sampled
 from scipy import stats
 
 from benchmarks.compare import compare
@@ -47,8 +48,7 @@ def drawn(rng: np.random.Generator, sigmas: np.ndarray, shift: dict[int, float] 
 # -- chance -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kept", [False, True], ids=["pooled", "scatter of the file"])
-@pytest.mark.parametrize("unlike", [4.0, math.inf], ids=["unlike cells", "like cells"])
+@pytest.mark.parametrize(("kept", "unlike"), sampled(itertools.product([False, True], [4.0, math.inf]), 4))
 def test_chance_alone_gives_no_more_alarms_than_it_may(kept: bool, unlike: float) -> None:
     rng = np.random.default_rng(1)
     times, alarms = 200, 0

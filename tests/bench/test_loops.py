@@ -45,6 +45,7 @@ def test_true_loops_are_told_from_false_ones(dataset: Dataset) -> None:
     assert found["alike"] == 8 and found["accepted"] == 0 and found["keyframes"] > 3 and found["search_s"] > 0
 
 
+@pytest.mark.nightly
 def test_look_alikes_of_another_recording(dataset: Dataset) -> None:
     """In a mirror the room is another one; the room itself is the same place, though it is called another's."""
     accepted = []

@@ -152,6 +152,7 @@ cells: [{{cases: [tiny], methods: [{method}], measure: {measure}, settings: {set
     return cells.records[f"{measure}/tiny/{method}"]
 
 
+@pytest.mark.nightly
 def test_light_is_baked_anew_and_compared(tmp_path: Path) -> None:
     record = measured(tmp_path, "light", "{views: 2, spp: 256, width: 24}")
     assert record.error is None and not list(tmp_path.rglob(".rsgen-cache")) and not (tmp_path / "cache").exists()
@@ -162,6 +163,7 @@ def test_light_is_baked_anew_and_compared(tmp_path: Path) -> None:
     assert (tmp_path / "out/cells/light/tiny/rsgen/light.png").stat().st_size > 1000
 
 
+@pytest.mark.nightly
 def test_frames_are_timed_by_a_process_of_its_own(tmp_path: Path) -> None:
     settings = "{modes: [still, rs-blur], frames: 1, spp: 2}"
     record = measured(tmp_path, "render", settings)

@@ -11,6 +11,7 @@ from rstrack.bench.cells import load_benchmark
 from rstrack.bench.record import read_records
 
 
+@pytest.mark.nightly
 def test_every_measure_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -81,6 +81,7 @@ def kill_one_at_work(workers: DaskWorkers, when: Path, killed: list[int]) -> thr
     return thread
 
 
+@pytest.mark.nightly
 def test_a_killed_worker_changes_no_byte(
     here: dict[str, str], config: Config, workers: DaskWorkers, folder: Path
 ) -> None:

@@ -87,9 +87,9 @@ def test_a_library_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> No
     ("versions", "chosen"),
     [
         ({"libLLVM.so": 19}, "libLLVM.so"),
-        ({"libLLVM-22.so": 22, "libLLVM-19.so": 19, "libLLVM-16.so": 16}, "libLLVM-19.so"),  # the fastest
+        ({"libLLVM-22.so": 22, "libLLVM-19.so": 19, "libLLVM-17.so": 17}, "libLLVM-19.so"),  # the fastest
         ({"libLLVM-16.so": 16, "libLLVM-18.so": 18, "libLLVM-17.so": 17}, "libLLVM-18.so"),  # else the newest
-        ({"libLLVM-15.so": 15, "libLLVM-14.so": 14, "libLLVM-16.so": 16}, "libLLVM-16.so"),
+        ({"libLLVM-16.so": 16, "libLLVM-14.so": 14, "libLLVM-17.so": 17}, "libLLVM-17.so"),
         ({"libLLVM-19.so": 15, "libLLVM-9.so": 20}, "libLLVM-9.so"),  # names may lie
         ({"libLLVM-19.so": None, "libLLVM-20.so": 20}, "libLLVM-20.so"),  # broken ones are passed over
     ],
@@ -108,29 +108,29 @@ def test_links_to_one_library_are_asked_once(installed, monkeypatch: pytest.Monk
     assert backend.find_libllvm() == str(folder / "libLLVM-19.so.1") and len(asked) == 1
 
 
-@pytest.mark.parametrize("versions", [{}, {"libLLVM-15.so": 15}, {"libLLVM-14.so": 14, "libLLVM.so": None}])
+@pytest.mark.parametrize("versions", [{}, {"libLLVM-16.so": 16}, {"libLLVM-14.so": 14, "libLLVM.so": None}])
 def test_without_a_usable_one_a_sentence_says_what_to_do(installed, versions: dict[str, int | None]) -> None:
     installed(versions)
     with pytest.raises(UserError) as error:
         backend.select("llvm")
     text = str(error.value)
-    assert "\n" not in text and "16 or newer" in text and "apt-get install libllvm19" in text
+    assert "\n" not in text and "17 or newer" in text and "apt-get install libllvm19" in text
     assert "DRJIT_LIBLLVM_PATH" in text and "DRJIT_LIBLLVM_PATH" not in os.environ
 
 
-@pytest.mark.parametrize("version", [15, 14, None])
+@pytest.mark.parametrize("version", [16, 14, None])
 def test_an_unusable_one_is_refused_even_if_named(
     installed, monkeypatch: pytest.MonkeyPatch, version: int | None
 ) -> None:
     folder = installed({"libLLVM-19.so": 19, "mine.so": version})
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(folder / "mine.so"))
-    with pytest.raises(UserError, match=r"DRJIT_LIBLLVM_PATH=.*mine\.so is .*16 or newer") as error:
+    with pytest.raises(UserError, match=r"DRJIT_LIBLLVM_PATH=.*mine\.so is .*17 or newer") as error:
         backend.select("llvm")
     assert (f"LLVM {version}" if version else "no usable libLLVM") in str(error.value)
 
 
 def test_a_usable_one_that_is_named_is_taken(installed, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = installed({"libLLVM-19.so": 19, "mine.so": 16})
+    folder = installed({"libLLVM-19.so": 19, "mine.so": 17})
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(folder / "mine.so"))
     assert backend.select("llvm") == "llvm_ad_rgb"
     assert os.environ["DRJIT_LIBLLVM_PATH"] == str(folder / "mine.so")

@@ -16,6 +16,7 @@ import pytest
 import synthetic
 import yaml
 from exported import RADTAN, make_plain, with_color
+from nightly import sampled
 
 from rsgen.cli.main import main
 from rsgen.errors import UserError
@@ -147,7 +148,7 @@ def test_the_baseline_names_its_script_and_modes(tmp_path: Path, monkeypatch: py
     assert baseline.is_installed()[0]
 
 
-@pytest.mark.parametrize("rows_are_known", [True, False])
+@pytest.mark.parametrize("rows_are_known", sampled([True, False], 2))
 def test_the_baselines_script_tracks_what_an_experiment_lists(rows_are_known: bool, tmp_path: Path) -> None:
     root = synthetic.make_sequence(tmp_path / "seq", synthetic.make_config(160, 120), frames=8)
     sequence = tmp_path / "benchmark"

@@ -104,6 +104,7 @@ def test_a_ply_with_vertex_colours_renders_as_written_by_hand(tmp_path: Path) ->
     assert by_baked_light > 40
 
 
+@pytest.mark.nightly
 def test_shiny_surfaces_look_the_same_traced_and_in_baked_light(tmp_path: Path) -> None:
     """Balls of plastic, of metal and of something between."""
     scene = trimesh.Scene([textured(quad((-2, -0.55, 2), (2, -0.55, 2), (2, -0.55, -2), (-2, -0.55, -2)))])

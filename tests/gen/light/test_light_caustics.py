@@ -135,6 +135,7 @@ def test_looked_for_from_the_floor_it_is_the_same(tmp_path: Path, bsdf: str) -> 
     assert np.abs(ratio - 1).max() < 0.03
 
 
+@pytest.mark.nightly
 def test_a_lamp_in_satin_lights_the_floor_as_its_lobe_says(tmp_path: Path) -> None:
     xyz = beyond_the_lamp(3)
     scene = scene_of(tmp_path, FLOOR, LAMP, wall(SATIN))

@@ -173,6 +173,7 @@ def test_points_that_are_not_alive_do_not_count(shapes: Any) -> None:
     np.testing.assert_allclose(got[lit], smooth(hit[lit]), atol=0.04)
 
 
+@pytest.mark.nightly
 def test_light_is_continuous_over_edges_that_triangles_share(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, *CORNELL)
     lattice, front, back = bake(scene, bounces=2, direct_samples=64)

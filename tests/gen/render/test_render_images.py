@@ -41,6 +41,7 @@ def scene(room: Path) -> Any:
 # --- blur
 
 
+@pytest.mark.nightly
 def test_blur_is_the_mean_of_sharp_frames_over_each_lines_window(scene: Any) -> None:
     """A sharp frame stamped τ before the stamp shows each row τ before that row's end of exposure."""
     exposure, strata = 0.04, 64

@@ -177,6 +177,7 @@ def test_suite_yaml_names_every_sequence_with_tier_and_role(made: Path) -> None:
     assert entries["row_20ms"]["readout_ms"] == {"color": 20.0, "depth": 20.0} and suite["version"] == "1.0"
 
 
+@pytest.mark.nightly
 def test_killed_at_any_moment_the_same_command_makes_the_same_bytes(
     definition: Path, made: Path, tmp_path: Path
 ) -> None:

@@ -57,6 +57,7 @@ def test_a_lens_and_depth_are_put_right(shaken: Dataset) -> None:
     assert "colour fx" in text and "depth offset" in text and "depth's scale cannot be determined" in text
 
 
+@pytest.mark.nightly
 def test_a_lens_that_is_right_is_left_as_it_is_and_noise_makes_sigmas_grow(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 1.2e-3, 0.01, 1))
     plain = calibrate(shaken, ("readout",), SHORT, OPTIONS)

@@ -48,6 +48,7 @@ def test_lines_that_are_read_the_other_way_are_seen_to_be(tmp_path: Path) -> Non
     assert "depth is read bottom-top, not top-bottom" in found.text()
 
 
+@pytest.mark.nightly
 def test_columns_are_told_from_rows_where_nobody_names_them(tmp_path: Path) -> None:
     sideways = recording(tmp_path / "seq", shaking(), scan="right-left")
     unnamed = replace(told(sideways, 0.0, 0.0, np.zeros(6)), scan_named=False)
@@ -56,6 +57,7 @@ def test_columns_are_told_from_rows_where_nobody_names_them(tmp_path: Path) -> N
         assert shutter.scan == "right-left" and shutter.readout_s == pytest.approx(READOUT_S, abs=2e-4)
 
 
+@pytest.mark.nightly
 def test_an_image_exposed_at_once_has_no_readout(tmp_path: Path) -> None:
     at_once = recording(tmp_path / "seq", shaking(), readout_s=0.0)
     found = calibrate(told(at_once, 0.012, 0.0, np.zeros(6)), ("readout",), SHORT, OPTIONS)

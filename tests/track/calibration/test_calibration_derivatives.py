@@ -185,6 +185,7 @@ def test_points_move_as_pixels_do_when_a_lens_or_depth_changes(model: Model) -> 
         np.testing.assert_allclose(-shift[unique, 2], grown[unique], rtol=0.02, atol=5e-3, err_msg=name)
 
 
+@pytest.mark.nightly
 def test_wrong_cameras_are_put_right(shaken: Dataset) -> None:
     moved, late_s = np.array([3e-3, -3e-3, 2e-3, 0.005, -0.004, 0.004]), 0.008
     wrong = told(shaken, 0.0, late_s, moved)

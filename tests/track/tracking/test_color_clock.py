@@ -111,6 +111,7 @@ def test_a_clock_is_looked_for_by_depth_alone_along_a_track_that_is_made_once(
     assert list(tracks) == list(tracks) == [None] and asked == [(range(9), "rs-g")]
 
 
+@pytest.mark.nightly
 @needs_rpy
 def test_the_offset_of_a_kinect(tmp_path: Path) -> None:
     """SOURCE.md: about 22 ms, found by trial with stamps straightened over all of the recording."""

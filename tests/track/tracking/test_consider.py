@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic
+from nightly import sampled
 from shaken_recording import OPTIONS, SHORT
 from shaken_recording import told as told_wrongly
 
@@ -95,12 +96,12 @@ def wrong(name: str, by: float) -> tuple[Rig, float, float]:
 
 @pytest.mark.parametrize(
     ("name", "by", "method", "part"),
-    [
-        ("depth.focal", 0.01, "rs-g", 0.5), ("depth.aspect", 0.01, "rs-g", 0.5), ("depth.cx", 0.01, "rs-g", 0.5),
-        ("depth.cy", 0.01, "rs-g", 0.5), ("depth.k1", 0.05, "rs-g", 0.5), ("depth.scale", 0.01, "rs-g", 0.1),
-        ("depth.focal", 0.01, "rs-pg", 0.5), ("depth.scale", 0.01, "rs-pg", 0.1), ("depth.scale", 0.01, "rs-p", 0.1),
+    sampled([
+        ("depth.focal", 0.01, "rs-pg", 0.5), ("depth.focal", 0.01, "rs-g", 0.5), ("depth.aspect", 0.01, "rs-g", 0.5),
+        ("depth.cx", 0.01, "rs-g", 0.5), ("depth.cy", 0.01, "rs-g", 0.5), ("depth.k1", 0.05, "rs-g", 0.5),
+        ("depth.scale", 0.01, "rs-g", 0.1), ("depth.scale", 0.01, "rs-pg", 0.1), ("depth.scale", 0.01, "rs-p", 0.1),
         ("color.focal", 0.01, "rs-p", 0.6), ("color.k1", 0.03, "rs-p", 0.6),
-    ],
+    ], 3),
 )  # fmt: skip
 def test_a_wrong_camera_moves_poses_as_the_model_says(name: str, by: float, method: str, part: float) -> None:
     """To that part: the model is of first order, and made of some hundred points."""
@@ -200,7 +201,7 @@ def test_it_is_the_solution_of_all_frames_at_once() -> None:
     np.testing.assert_allclose(known.covariance, np.linalg.inv(A), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("late_s", [0.006, -0.006])
+@pytest.mark.parametrize("late_s", sampled([0.006, -0.006], 2))
 def test_a_clock_is_found_while_tracking(shaken: Dataset, tmp_path: Path, late_s: float) -> None:
     """As far as σ says, though the first keyframes have the old one; what is done with the run later goes by it."""
     wrong = told_wrongly(shaken, shaken.rig.color_shutter.readout_s, late_s, np.zeros(6))

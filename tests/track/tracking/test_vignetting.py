@@ -113,6 +113,7 @@ def test_points_that_depth_does_not_show_where_they_were_do_not_count(shaken: Da
     assert 0.5 < later.mean() < 1.0
 
 
+@pytest.mark.nightly
 @needs_rpy
 def test_a_kinect_darkens(tmp_path: Path) -> None:
     """Nobody has measured it otherwise; two halves of the recording agree."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from nightly import sampled
 from rstrack_util import ENGINE, Plane
 
 from rsgen.errors import UserError
@@ -143,7 +144,7 @@ def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rstrack.volume.blocks._FIRST_BLOCKS", 16)
 
 
-@pytest.mark.parametrize("color", [False, True])
+@pytest.mark.parametrize("color", sampled([True, False], 2))
 def test_what_is_far_away_goes_to_a_file_and_comes_back_to_the_bit(
     monkeypatch: pytest.MonkeyPatch, small_window: None, color: bool
 ) -> None:
