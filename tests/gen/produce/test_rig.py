@@ -191,11 +191,12 @@ def test_euroc_and_kalibr_have_all_cameras_where_they_are(root: Path, rig: Rig, 
     assert main(["export", "colmap", str(other), "--quiet"]) == 2  # there is no depth camera
 
 
-def test_a_bag_has_every_image_and_camera(root: Path, rig: Rig, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "name"), [("ros1", "rig.bag"), ("ros2", "rig"), ("mcap", "rig.mcap")])
+def test_a_bag_has_every_image_and_camera(root: Path, rig: Rig, tmp_path: Path, kind: str, name: str) -> None:
     rosbags = pytest.importorskip("rosbags.highlevel")
-    assert main(["export", "mcap", str(root), "--out", str(tmp_path / "rig.mcap"), "--quiet"]) == 0
+    assert main(["export", kind, str(root), "--out", str(tmp_path / name), "--quiet"]) == 0
     facts = None
-    with rosbags.AnyReader([tmp_path / "rig.mcap"]) as reader:
+    with rosbags.AnyReader([tmp_path / name]) as reader:
         seen: dict[str, int] = {}
         for connection, _, raw in reader.messages():
             seen[connection.topic] = seen.get(connection.topic, 0) + 1
@@ -207,11 +208,11 @@ def test_a_bag_has_every_image_and_camera(root: Path, rig: Rig, tmp_path: Path) 
                 children = {t.child_frame_id: t for t in message.transforms}
             if connection.topic == "/camera/rolling_shutter":
                 facts = json.loads(message.data)
-    assert {f"{name}_optical_frame" for name in STREAMS} < set(children)
+    assert {f"{one}_optical_frame" for one in STREAMS} < set(children)
     found = children["front_optical_frame"].transform.translation
     np.testing.assert_allclose([found.x, found.y, found.z], np.array(STREAMS["front"]["T_body_cam"])[:3, 3], atol=1e-12)
-    assert all(seen[f"/camera/{name}/image_{'rect_raw' if 'depth' in STREAMS[name]['kind'] else 'raw'}"] == FRAMES
-               for name in STREAMS)  # fmt: skip
+    assert all(seen[f"/camera/{one}/image_{'rect_raw' if 'depth' in STREAMS[one]['kind'] else 'raw'}"] == FRAMES
+               for one in STREAMS)  # fmt: skip
     assert facts is not None and set(facts["streams"]) == set(STREAMS)
 
 
