@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tiny
@@ -214,6 +215,26 @@ def test_a_bag_has_every_image_and_camera(root: Path, rig: Rig, tmp_path: Path, 
     assert all(seen[f"/camera/{one}/image_{'rect_raw' if 'depth' in STREAMS[one]['kind'] else 'raw'}"] == FRAMES
                for one in STREAMS)  # fmt: skip
     assert facts is not None and set(facts["streams"]) == set(STREAMS)
+
+
+def test_ncore_has_every_image_and_line(root: Path, rig: Rig, tmp_path: Path) -> None:
+    v4 = pytest.importorskip("ncore.data.v4")
+    assert main(["export", "ncore", str(root), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    (path,) = (tmp_path / "out").iterdir()
+    loader = v4.SequenceLoaderV4(v4.SequenceComponentGroupsReader([path]))
+    assert sorted(loader.camera_ids) == sorted(STREAMS)
+    for name, stream in rig.streams.items():
+        camera = loader.get_camera_sensor(name)
+        of_file = cv2.imread(str(stream.paths[1]), cv2.IMREAD_UNCHANGED)
+        of_library = np.asarray(camera.get_frame_handle(1).get_data().get_decoded_image())
+        np.testing.assert_array_equal(of_library, of_file if of_file.ndim == 2 else of_file[..., ::-1])
+        # The pose of each line, as the library interpolates it between the times that it has of the first and the last.
+        part = np.arange(stream.line_count) / max(stream.line_count - 1, 1)
+        at = camera.frames_timestamps_us[1].astype(float) @ np.stack([1 - part, part])
+        T_world_cam = loader.pose_graph.evaluate_poses(name, "world", np.rint(at).astype(np.uint64))
+        windows = [line_window(stream.shutter, stream.stamps[1], k, stream.camera) for k in range(stream.line_count)]
+        expected = rig.spline.pose(np.mean(windows, axis=1)) @ se3.inverse(stream.T_cam_body)
+        np.testing.assert_allclose(T_world_cam, expected, atol=1e-5)
 
 
 def changed(name: str, **fields: Any) -> dict[str, Any]:
