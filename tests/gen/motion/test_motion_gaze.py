@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from rsgen.motion.walk import choose_targets, seen_from
+from rsgen.motion.walk import AZIMUTHS, ELEVATIONS_DEG, choose_targets, seen_from
 
 
 def test_a_view_of_one_plane_is_flat_and_one_of_a_corner_is_not() -> None:
@@ -54,7 +54,7 @@ def test_what_a_room_holds_is_looked_at_rather_than_its_bare_half() -> None:
     angle = np.linspace(0, math.tau, 16, endpoint=False)
     walk = np.stack([1.4 * np.cos(angle), np.full(16, 0.15), 1.4 * np.sin(angle)], axis=1)
 
-    def turned_there(*meshes: Any) -> float:
+    def turned_there(*meshes: Any, color: np.ndarray | None = None) -> float:
         mesh = trimesh.util.concatenate(meshes)
 
         def cast(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,8 +64,16 @@ def test_what_a_room_holds_is_looked_at_rather_than_its_bare_half() -> None:
             normal[ray] = mesh.face_normals[face]
             return distance, normal
 
-        gaze = choose_targets(walk, cast, 0.2, np.random.default_rng(0)) - walk
+        place, target = choose_targets(walk, cast, 0.2, np.random.default_rng(0), color)
+        gaze = target - place
         return float(np.mean(gaze[:, 2] < 0))
 
     assert turned_there(room) < 0.6
     assert turned_there(room, *things) > 0.75
+    # Without them, were that wall painted: directions towards it have edges, the others none or are burnt out too.
+    azimuth = np.arange(AZIMUTHS) * (math.tau / AZIMUTHS)
+    color = np.zeros((2, 16, AZIMUTHS, len(ELEVATIONS_DEG)))
+    color[0, :, np.sin(azimuth) < -0.5] = 0.2
+    painted = turned_there(room, color=color)
+    color[1, :, np.sin(azimuth) > 0] = 0.3
+    assert turned_there(room) < painted and turned_there(room, color=color) > 0.75
