@@ -30,7 +30,7 @@ _AIMED = 0.75  # of MOST_CLIPPED, in the instants that are looked at: others lie
 _GREY = 0.18  # what half of the pixels are to be brighter than
 _MOST, _WHITE = 0.7, 0.6  # of the pixels, that are not to be brighter than this: windows may, white walls not
 _ENOUGH = 2.0  # a factor that is not worth the while
-_DARK = 0.007  # linear: 20 of 255 in sRGB
+_DARK = 0.02  # linear: 38 of 255 in sRGB, where noise hides what little contrast is left
 _MUCH_DARK, _LIGHTER = 0.25, 0.7  # of the pixels; automatic exposure must leave less than that part of it
 _TARGETS = (0.53, 0.46, 0.4, 0.34, 0.28, 0.22)  # of automatic exposure: its default, then ever less
 _EDGE = 0.03  # of the intensity, 0..1, from one pixel of so small a picture to the next
@@ -146,7 +146,7 @@ def score(views: Views, brightness: FloatArray) -> Scores:
     """How good views are with their light multiplied by brightness (n,)."""
     exposed = views.light * brightness.astype(np.float32)[None, :, None, None, None]
     peak = _peak(exposed)
-    clipped, dark = (peak >= 1).mean(axis=(1, 2)), (peak < _DARK).mean(axis=(1, 2))
+    clipped, dark = (peak > 1).mean(axis=(1, 2)), (peak < _DARK).mean(axis=(1, 2))
     edges = _edge_map(exposed).mean(axis=(1, 2))
     return Scores(clipped, dark, np.maximum(edges, 0.0), views.shape, views.nearest)
 
@@ -180,7 +180,7 @@ def suggested_exposure(light: Float32Array, gain: float) -> Exposure | None:
     dark = float((peak * wanted < _DARK).mean())
     for target in _TARGETS if dark > _MUCH_DARK else ():
         exposed = peak * adapted(light, target)[:, None, None]
-        if (exposed >= 1).mean() <= _AIMED * MOST_CLIPPED:
+        if (exposed > 1).mean() <= _AIMED * MOST_CLIPPED:
             if (exposed < _DARK).mean() < _LIGHTER * dark:
                 return Exposure(float(f"{np.median(adapted(light, target)):.2g}"), target)
             break
@@ -234,7 +234,7 @@ def plainness(p_world: FloatArray, shine: Shine, azimuths: int, elevations_deg: 
     light = _smoothed(light)
     gain = _typical_gain(light)
     exposed = light * np.float32(1.0 if gain is None else gain)
-    maps = np.stack([_edge_map(exposed), _peak(exposed) >= 1])
+    maps = np.stack([_edge_map(exposed), _peak(exposed) > 1])
     cells = maps.reshape(2, len(p_world), azimuths, wide, len(elevations_deg), high)
     return np.asarray(cells.mean(axis=(3, 5)))
 
