@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -165,10 +164,7 @@ _CHANCE = 0.15
 _EASY_DEG = 30.0
 _MOST_DEG = 60.0  # from a waypoint to the next: the targets' chord stays well before the camera
 _TARGET_M = 2.0
-# Planes through every so many of the rays' hits are tried; what is as near to one as this part of its distance is on
-# it; and a view is flat where such a part of its rays is on one.
-_PLANE_RAYS, _PLANE, _FLAT = 7, 0.02, 0.9
-_GRID = np.linspace(-0.95, 0.95, 12)
+_PLANE = 0.02  # what is as near to a plane as this part of its distance is on it
 
 
 def choose_targets(
@@ -193,36 +189,6 @@ def choose_targets(
     target = p_world + _TARGET_M * _direction(azimuth * (math.tau / AZIMUTHS), pitch)
     first = int(np.minimum(chosen.max(axis=1), np.roll(chosen.max(axis=1), -1)).argmax())
     return np.roll(p_world, -first, axis=0), np.roll(target, -first, axis=0)
-
-
-@dataclass(frozen=True)
-class ViewContents:
-    """What a grid of rays through the views of cameras meets: distances (n, rays) in m, inf for nothing, and flat (n,):
-    whether a view holds next to nothing but one plane, along which and about whose normal depth tells of no motion.
-    """
-
-    distance: FloatArray
-    flat: BoolArray
-
-
-def seen_from(T_world_cam: FloatArray, cast: Cast) -> ViewContents:
-    """What cameras at poses (n, 4, 4) see."""
-    x, y = np.meshgrid(np.tan(np.radians(_HALF_WIDTH_DEG)) * _GRID, np.tan(np.radians(_HALF_HEIGHT_DEG)) * _GRID)
-    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    direction = np.einsum("nij,rj->nri", T_world_cam[:, :3, :3], rays).reshape(-1, 3)
-    origin = np.repeat(T_world_cam[:, :3, 3], len(rays), axis=0)
-    distance, normal = cast(origin, direction)
-    p_world = origin + np.where(np.isfinite(distance), distance, 0.0)[:, None] * direction
-    grid = len(T_world_cam), len(rays)
-    distance, p_world, normal = (a.reshape(*grid, *a.shape[1:]) for a in (distance, p_world, normal))
-    # How many lie on the plane of one of them, of a few.
-    few = slice(None, None, _PLANE_RAYS)
-    off = np.einsum("nrk,nck->ncr", p_world, normal[:, few])
-    off -= np.einsum("nck,nck->nc", p_world[:, few], normal[:, few])[..., None]
-    there = np.isfinite(distance)
-    on = there[:, None] & (np.abs(off) < _PLANE * np.where(there, distance, 0.0)[:, None]) & there[:, few, None]
-    return ViewContents(distance, on.mean(axis=2).max(axis=1) > _FLAT)
 
 
 def _direction(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import clearance, plan_tour
 from rsgen.motion.floor_plan import FloorPlan
 from rsgen.motion.make import least_turning
-from rsgen.motion.walk import AZIMUTHS, ELEVATIONS_DEG, choose_targets, ring, seen_from, walk_inside
+from rsgen.motion.walk import AZIMUTHS, ELEVATIONS_DEG, choose_targets, ring, walk_inside
 from rsgen.produce.generate import scene_triangles
 from rsgen.produce.parts import load_motion
 from rsgen.produce.tour import (
@@ -72,7 +72,6 @@ _HAND: dict[str, Any] = {
 }
 _LARGE_M2, _TEXELS = 300.0, 1.15e6  # a larger surface gets coarser light than the default: about so many texels
 _CAMERAS = ("color", "depth", "T_color_depth", "truth", "imu", "mocap", "tremor", "faults")
-_FLAT = 0.1  # of the views, that hold nothing but one plane: for fewer, other ways are tried
 _GOOD = 0.9  # a tour whose worst views are worth so much is taken without looking for another
 _LINE_S = 0.01  # exposure of an automatic camera's lines, from which it changes it, where a config has none
 
@@ -173,7 +172,7 @@ def suggest_tour(
         tour = _looked_at(scene, config, spline, least)
         if best is None or _merit(tour) > _merit(best[0]):
             best = tour, config
-        if best[0].flat <= _FLAT and best[0].scores.worst >= _GOOD:
+        if best[0].scores.worst >= _GOOD:
             break
     if best is None:
         raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
@@ -204,12 +203,12 @@ def _looked_at(scene: TourScene, config: Config, spline: Spline, least: float) -
         exposure = None if exposure is None else replace(exposure, target=None)
     fixed = np.full(len(T_world_cam), gain if exposure is None else exposure.gain)
     scores = score(views, fixed if target is None else adapted(views.light, target))
-    return Tour(spline, seconds, least, seen_from(T_world_cam, scene.cast), exposure, scores)
+    return Tour(spline, seconds, least, views.distance, exposure, scores)
 
 
-def _merit(tour: Tour) -> tuple[bool, float]:
-    """By which one of two tours is preferred: its worst views first, and all where these are alike."""
-    return tour.flat <= _FLAT, tour.scores.worst + 0.3 * float(tour.scores.worth.mean())
+def _merit(tour: Tour) -> float:
+    """By which one of two tours is preferred: its worst views above all."""
+    return tour.scores.worst + 0.3 * float(tour.scores.worth.mean())
 
 
 def _through(

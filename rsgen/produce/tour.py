@@ -15,7 +15,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
 from rsgen.motion.statistics import motion_statistics
-from rsgen.motion.walk import ViewContents, free_region
+from rsgen.motion.walk import free_region
 from rsgen.produce.views import MOST_CLIPPED, Exposure, Scores, Shine
 
 REACH_M = 1.0  # surfaces farther off are not reported
@@ -112,21 +112,16 @@ def find_thing(scene: TourScene) -> Thing:
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """A config's spline, how long it lasts, its least distance to surfaces in m, what the camera sees along it, and how
-    that is to be exposed (None: as it is) and how good it is then.
+    """A config's spline, how long it lasts, its least distance to surfaces in m, how far off the camera sees something
+    along it (n, pixels), m, how that is to be exposed (None: as it is), and how good it is then.
     """
 
     spline: Spline
     seconds: float
     least: float
-    seen: ViewContents
+    distance: FloatArray
     exposure: Exposure | None
     scores: Scores
-
-    @property
-    def flat(self) -> float:
-        """Share of the views that hold nothing but one plane."""
-        return float(np.mean(self.seen.flat))
 
 
 def view_times(seconds: float) -> FloatArray:
@@ -155,7 +150,7 @@ def thing_text(size: FloatArray) -> str:
 def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:
     """What the spline is like, and what its camera sees. rotation_deg_s: mean that was wished for, if any."""
     stats = motion_statistics(tour.spline, 0.0, tour.seconds)
-    distance, least = tour.seen.distance, tour.least
+    distance, least = tour.distance, tour.least
     near, far = _SEEN_M
     seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
     lines = [
@@ -168,9 +163,9 @@ def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:
         lines.append(f"turns faster than the {rotation_deg_s:.0f} deg/s of the other: what it looks at asks for it")
     if nothing > _EMPTY:
         lines.append("much of the views is empty: a floor and walls would help a tracker")
-    if tour.flat > 0:
-        flat = f"one plane fills {100 * tour.flat:.0f} % of the views"
-        lines.append(f"{flat}: depth alone does not tell how the camera moves there")
+    if (flat := tour.scores.flat) > 0:
+        text = f"next to nothing but one plane in {100 * flat:.0f} % of the views"
+        lines.append(f"{text}: depth alone does not tell how the camera moves there")
     lines.append(tour.scores.text())
     clipped = float(tour.scores.clipped.mean())
     if clipped > MOST_CLIPPED:

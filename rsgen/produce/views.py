@@ -37,6 +37,7 @@ _EDGE = 0.03  # of the intensity, 0..1, from one pixel of so small a picture to 
 _FAR_M = 8.0  # a depth camera sees no farther
 # What is enough of a view: furnished public rooms have about twice that shape in the mean, bare walls a tenth.
 _EDGES, _SHAPE, _NEAR_M = 0.05, 0.01, 0.4
+_FLAT = 0.1  # of that shape: bare walls have no more
 _BAD_CLIPPED, _BAD_DARK = 0.4, 0.8  # of a view's pixels: it is worth nothing
 _WORST = 0.1  # of the views, by which a tour is judged
 _PANORAMA_DEG = 3.75
@@ -46,12 +47,17 @@ _PANORAMA_DEG = 3.75
 class Views:
     """What a camera sees at instants of a tour. light: (2, n, h, w, 3) linear radiance, independent halves, each
     pixel the mean of nine. shape: (n,) smallest eigenvalue of the point-to-plane information a pixel, rotations scaled
-    by the mean depth: near 0 where depth leaves a motion open. nearest: (n,) m, of all but a hundredth of the pixels.
+    by the mean depth: near 0 where depth leaves a motion open. distance: (n, pixels) m, inf for nothing.
     """
 
     light: Float32Array
     shape: FloatArray
-    nearest: FloatArray
+    distance: FloatArray
+
+    @property
+    def nearest(self) -> FloatArray:
+        """(n,) m, of all but a hundredth of the pixels."""
+        return np.quantile(self.distance, 0.01, axis=1, method="lower")
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,11 @@ class Scores:
             (_BAD_CLIPPED - self.clipped) / (_BAD_CLIPPED - MOST_CLIPPED), (_BAD_DARK - self.dark) / (_BAD_DARK - 0.5),
         )  # fmt: skip
         return np.clip(np.min(parts, axis=0), 0.0, 1.0)
+
+    @property
+    def flat(self) -> float:
+        """Share of the views along or about whose one plane depth tells next to nothing of a motion."""
+        return float(np.mean(self.shape < _FLAT * _SHAPE))
 
     @property
     def worst(self) -> float:
@@ -122,9 +133,8 @@ def views_along(T_world_cam: FloatArray, camera: Camera, cast: Cast, shine: Shin
     p = np.where(np.isfinite(distance), distance, 0.0)[:, None] * direction
     seen = zip(p.reshape(*shape, 3), normal.reshape(*shape, 3), distance.reshape(shape), strict=True)
     constraint = np.array([_constraint(p, n, d < _FAR_M) for p, n, d in seen])
-    nearest = np.quantile(distance.reshape(shape), 0.01, axis=1, method="lower")
     light = shine(origin, direction, 0).reshape(2, len(T_world_cam), *rays.shape)
-    return Views(_smoothed(light), constraint, nearest)
+    return Views(_smoothed(light), constraint, distance.reshape(shape))
 
 
 def _smoothed(light: Float32Array) -> Float32Array:

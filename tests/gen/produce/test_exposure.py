@@ -60,7 +60,7 @@ def test_windows_do_not_clip_more_than_two_percent() -> None:
     light[:, :, :12, :10] = 4.0
     exposure = suggested_exposure(light, 1.8)
     assert exposure is not None and exposure.target is None and 0.2 < exposure.gain <= 0.25
-    views = Views(light, np.ones(4), np.ones(4))
+    views = Views(light, np.ones(4), np.ones((4, 1)))
     assert score(views, np.full(4, exposure.gain)).clipped.max() == 0
     assert score(views, np.full(4, 1.8)).clipped == pytest.approx(0.1)
 
@@ -72,7 +72,7 @@ def test_a_dark_room_beside_a_bright_one_asks_for_automatic_exposure() -> None:
     light[:, 3:] *= 1e-3
     exposure = suggested_exposure(light, 1.0)
     assert exposure is not None and exposure.target == 0.53
-    scores = score(Views(light, np.ones(6), np.ones(6)), adapted(light, exposure.target))
+    scores = score(Views(light, np.ones(6), np.ones((6, 1))), adapted(light, exposure.target))
     assert scores.clipped.mean() <= MOST_CLIPPED and scores.dark.max() == 0
 
 

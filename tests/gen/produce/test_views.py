@@ -38,7 +38,9 @@ def test_shape_is_what_depth_holds_the_camera_by() -> None:
     room = trimesh.creation.box((2, 1.5, 4))
     room.invert()
     corner = views_along(T, CAMERA, cast_into(room), grey)
-    assert views_along(T, CAMERA, cast_into(wall), grey).shape[0] < 1e-6 < 0.01 < corner.shape[0]
+    bare = views_along(T, CAMERA, cast_into(wall), grey)
+    assert bare.shape[0] < 1e-6 < 0.01 < corner.shape[0]
+    assert [score(views, np.ones(1)).flat for views in (bare, corner)] == [1.0, 0.0]
     assert corner.nearest[0] == pytest.approx(0.75 * np.hypot(1, 40 / 17.5), rel=0.02)  # ceiling, floor
     room.apply_scale(1.7)
     assert views_along(T, CAMERA, cast_into(room), grey).shape == pytest.approx(corner.shape, rel=1e-3)
@@ -53,9 +55,9 @@ def test_edges_are_what_both_halves_show() -> None:
     light[:, 1, :, :12:4] = 0.5
     light[:, 1, :, 1:12:4] = 0.5
     light += rng.normal(0.0, 0.05, light.shape).astype(np.float32)
-    edges = score(Views(light, np.ones(2), np.ones(2)), np.ones(2)).edges
+    edges = score(Views(light, np.ones(2), np.ones((2, 1))), np.ones(2)).edges
     assert edges[0] < 0.02 and 0.15 < edges[1] < 0.3
-    burnt = score(Views(light, np.ones(2), np.ones(2)), np.full(2, 100.0))
+    burnt = score(Views(light, np.ones(2), np.ones((2, 1))), np.full(2, 100.0))
     assert burnt.edges.max() == 0 and burnt.clipped.min() == 1 and burnt.worst == 0
 
 
@@ -63,7 +65,7 @@ def test_a_tour_is_judged_by_its_worst_views_and_told_by_the_second() -> None:
     light = np.full((2, 20, 36, 48, 3), 0.2, np.float32)
     light[:, :, :, ::3] = 0.5
     light[:, 13] = 0.2  # a bare wall
-    scores = score(Views(light, np.full(20, 0.05), np.full(20, 1.0)), np.ones(20))
+    scores = score(Views(light, np.full(20, 0.05), np.ones((20, 1))), np.ones(20))
     assert scores.worst == pytest.approx(0.5) and scores.worth.mean() == pytest.approx(0.95)
     lines = scores.per_second(0.5 + np.arange(20))
     assert len(lines) == 21 and [line.split()[1] for line in lines[1:]] == ["1.00"] * 13 + ["0.00"] + ["1.00"] * 6
