@@ -68,7 +68,8 @@ def suggest(
 ) -> int:
     """Propose a tour through a scene that has none: a config whose camera walks through the scene's largest room, or
     round what it holds, looks at what is 1 to 3 m away, and keeps its distance. Edit it, or render it as it is. With
-    --like table1 it is the counterpart of table1 in this scene; --seed gives as many ways through it as are wanted.
+    --like table1 it is the counterpart of table1 in this scene; --seed gives as many ways through it as are wanted. Of
+    several tours that with the best worst views is taken; with --out each second's score is printed.
     """
     from rsgen.config.config import load_config
     from rsgen.files import atomic_write
@@ -85,5 +86,5 @@ def suggest(
         print(text.decode(), end="")
         return 0
     atomic_write(out, text)
-    print("\n".join([*suggested.found, f"{out}: written (rsgen render {out})"]))
+    print("\n".join([*suggested.seconds, *suggested.found, f"{out}: written (rsgen render {out})"]))
     return 0

@@ -22,6 +22,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.image_codecs import encode_png
 from rsgen.produce.camera_sources import small_camera
 from rsgen.produce.parts import load_motion, load_scene
+from rsgen.produce.views import adapted
 from rsgen.sensors.color import to_srgb8
 from rsgen.sequence.reader import read_sequence
 
@@ -46,7 +47,7 @@ def sheet_of_sequence(path: Path, out: Path | None, every_s: float) -> Path:
 
 
 def sheet_of_config(config: Config, out: Path | None, every_s: float, progress: Progress) -> Path:
-    """Path trace small pictures along a config's motion, sharp, without noise, at its `exposure_gain`; write a PNG.
+    """Path trace small pictures along a config's motion, sharp and without noise, and write them as a PNG.
 
     Things that move by themselves are left out. Returns the PNG's path. Raises UserError.
     """
@@ -70,8 +71,11 @@ def sheet_of_config(config: Config, out: Path | None, every_s: float, progress: 
             progress("looking", k / len(t), f"{instant:.1f} s")
             light.append(color.render(T_world_cam, float(instant), k))
             z.append(depth.render(T_world_cam, float(instant)))
-    gain = own.exposure_gain if isinstance(own, ColorConfig) else 1.0
-    pictures = [to_srgb8(image, gain) for image in light]
+    linear, gains = np.stack(light), np.ones(len(t))
+    if isinstance(own, ColorConfig):
+        automatic = own.auto_exposure
+        gains = gains * own.exposure_gain if automatic is None else adapted(linear[None], automatic.target)
+    pictures = [to_srgb8(image, gain) for image, gain in zip(linear, gains.tolist(), strict=True)]
     return _write(sheet(pictures, z, t - t[0]), out or Path(f"{config.name}_sheet.png"))
 
 

@@ -15,17 +15,19 @@ import numpy as np
 import trimesh
 
 from rsgen.array_types import FloatArray
+from rsgen.config.cameras import AutoExposureConfig, ColorConfig
 from rsgen.config.config import Config, validate_config
 from rsgen.config.motion import MAX_DURATION_S, Waypoint
 from rsgen.config.sections import Up
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import encode_yaml
+from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import clearance, plan_tour
 from rsgen.motion.floor_plan import FloorPlan
 from rsgen.motion.make import least_turning
-from rsgen.motion.walk import choose_targets, ring, seen_from, walk_inside
+from rsgen.motion.walk import AZIMUTHS, ELEVATIONS_DEG, choose_targets, ring, walk_inside
 from rsgen.produce.generate import scene_triangles
 from rsgen.produce.parts import load_motion
 from rsgen.produce.tour import (
@@ -34,16 +36,26 @@ from rsgen.produce.tour import (
     Tour,
     TourScene,
     doubt,
+    exposure_text,
     find_room,
     find_thing,
     motion_text,
     room_text,
-    suggested_gain,
     thing_text,
     view_times,
 )
+from rsgen.produce.views import (
+    Exposure,
+    adapted,
+    path_traced,
+    plainness,
+    score,
+    suggested_exposure,
+    views_along,
+)
 
-_ATTEMPTS = 4
+# How much it counts, in one attempt after the other, that a view is burnt out: tours that shun windows may see little.
+_SHUNNED = (0.3, 0.0, 1.0)
 _CALM = (0.08, 0.2, 1.0, 4.0)
 _BRISK_DEG_S = 35.0  # mean rotational speed of hand-held recordings: 15 to 40
 _SWAY_SHARE, _SWAY_DEG_S = 1.08, 1.5  # what the slow turning adds to that of the tour
@@ -60,7 +72,8 @@ _HAND: dict[str, Any] = {
 }
 _LARGE_M2, _TEXELS = 300.0, 1.15e6  # a larger surface gets coarser light than the default: about so many texels
 _CAMERAS = ("color", "depth", "T_color_depth", "truth", "imu", "mocap", "tremor", "faults")
-_FLAT = 0.1  # of the views, that hold nothing but one plane: for fewer, other ways are tried
+_GOOD = 0.9  # a tour whose worst views are worth so much is taken without looking for another
+_LINE_S = 0.01  # exposure of an automatic camera's lines, from which it changes it, where a config has none
 
 
 @dataclass(frozen=True)
@@ -92,10 +105,11 @@ class Wish:
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A config whose motion keeps its distance, and what was found, a line a fact."""
+    """A config whose motion keeps its distance, what was found, a line a fact, and how good each second's views are."""
 
     config: Config
     found: tuple[str, ...]
+    seconds: tuple[str, ...] = ()
 
     def yaml(self, folder: Path) -> bytes:
         """The config as a file in `folder`, with what was found as its comment."""
@@ -131,8 +145,7 @@ def suggest_tour(
     from rsgen.render.scene import load_scene
 
     options = SceneOptions(scale, up, skip_missing=skip_missing)
-    names = "scale", "up", "skip_missing"
-    placed = {key: getattr(options, key) for key in names if getattr(options, key) != getattr(AS_IT_IS, key)}
+    placed = {k: v for k, v in vars(options).items() if v != getattr(AS_IT_IS, k)}
     if not 1e-9 <= scale <= 1e9:  # as scene.scale
         raise UserError(f"--scale {scale:g}: must lie in 1e-09 to 1e+09")
     loaded = load_scene(file, options=options)
@@ -140,26 +153,26 @@ def suggest_tour(
     fineness = 1.0 / coarser(triangles, inhabited_box([shape for shape in loaded.shapes() if shape.is_mesh()]))
     own = camera_up(file) if file.suffix.lower() == ".xml" else None
     hint = "" if own in (None, up) else f"its own camera has {own} up: --up {own}"
-    scene = TourScene(file, triangles, fineness, partial(cast_rays, loaded), placed, hint)
+    scene = TourScene(file, triangles, fineness, partial(cast_rays, loaded), path_traced(loaded), placed, hint)
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", file.stem) if name is None else name
     aim = find_room(scene, wish.clearance_m) or find_thing(scene)
     if (farthest := float(np.abs(scene.triangles).max())) > _FARTHEST_M:
         raise scene.wrong(f"reaches {farthest:.0f} m from the origin: scale it to metres, or move it to the origin")
     rng = np.random.default_rng(wish.seed)
     best: tuple[Tour, Config] | None = None
-    for _ in range(_ATTEMPTS):
-        tours = _through(scene, aim, wish, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
+    for shunned in _SHUNNED:
+        tours = (
+            _through(scene, aim, wish, shunned, rng) if isinstance(aim, FloorPlan) else [_round(scene, aim, wish, rng)]
+        )
         config = _config(scene, tours, name, wish, like)
         spline = load_motion(config).spline
         least = clearance(spline, scene.triangles, max(REACH_M, wish.clearance_m))
         if least < wish.clearance_m:
             continue
-        assert config.motion is not None
-        seconds = config.motion.duration_s
-        tour = Tour(spline, seconds, least, seen_from(spline.pose(view_times(seconds)), scene.cast))
-        if best is None or tour.flat < best[0].flat:
+        tour = _looked_at(scene, config, spline, least)
+        if best is None or _merit(tour) > _merit(best[0]):
             best = tour, config
-        if best[0].flat <= _FLAT:
+        if best[0].scores.worst >= _GOOD:
             break
     if best is None:
         raise scene.wrong(f"no tour found that keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
@@ -167,19 +180,48 @@ def suggest_tour(
     if isinstance(aim, FloorPlan):
         where += doubt(aim.floor.gap_m, scale)
     tour, config = best
-    config, how = _exposed(loaded, config, tour.spline)
+    is_lit = bool(loaded.emitters())
+    how = exposure_text(tour.exposure) if is_lit else ["it has no light, and what it shows is black: add an emitter"]
     found = (f"{file.name}: {where}", *((hint,) if hint else ()), *motion_text(tour, wish.rotation_deg_s), *how)
-    return Suggestion(config, found)
+    seconds = tour.scores.per_second(view_times(tour.seconds))
+    return Suggestion(_exposed(config, tour.exposure), found, tuple(seconds))
 
 
-def _through(scene: TourScene, plan: FloorPlan, wish: Wish, rng: np.random.Generator) -> list[tuple[Waypoint, ...]]:
-    """Tours through a room along one walk, whose gaze is ever calmer."""
+def _looked_at(scene: TourScene, config: Config, spline: Spline, least: float) -> Tour:
+    """The tour of a config: what is seen from it, how it is exposed, and how good that is."""
+    assert config.motion is not None
+    seconds = config.motion.duration_s
+    T_world_cam = spline.pose(view_times(seconds)) @ se3.inverse(config.T_cam_body(config.view))
+    camera = config.cameras[config.view]
+    gain = camera.exposure_gain if isinstance(camera, ColorConfig) else 1.0
+    views = views_along(T_world_cam, camera.camera, scene.cast, scene.shine)
+    # A camera that adapts already does so about another gain.
+    exposure = suggested_exposure(views.light, gain)
+    target = exposure.target if exposure is not None else None
+    if isinstance(camera, ColorConfig) and camera.auto_exposure is not None:
+        target = camera.auto_exposure.target
+        exposure = None if exposure is None else replace(exposure, target=None)
+    fixed = np.full(len(T_world_cam), gain if exposure is None else exposure.gain)
+    scores = score(views, fixed if target is None else adapted(views.light, target))
+    return Tour(spline, seconds, least, views.distance, exposure, scores)
+
+
+def _merit(tour: Tour) -> float:
+    """By which one of two tours is preferred: its worst views above all."""
+    return tour.scores.worst + 0.3 * float(tour.scores.worth.mean())
+
+
+def _through(
+    scene: TourScene, plan: FloorPlan, wish: Wish, shunned: float, rng: np.random.Generator
+) -> list[tuple[Waypoint, ...]]:
+    """Tours through a room along one walk, whose gaze is ever calmer. shunned: one of `_SHUNNED`."""
     p_world = walk_inside(plan, wish.seconds * wish.speed_m_s, wish.clearance_m, rng)
     if p_world is None:
         raise scene.wrong(f"no walk keeps {wish.clearance_m:g} m from all surfaces: reduce --clearance")
     state = int(rng.integers(2**31))
+    color = plainness(p_world, scene.shine, AZIMUTHS, ELEVATIONS_DEG) * np.reshape([1.0, shunned], (2, 1, 1, 1))
     return [
-        _waypoints(p_world, choose_targets(p_world, scene.cast, calm, np.random.default_rng(state))) for calm in _CALM
+        _waypoints(*choose_targets(p_world, scene.cast, calm, np.random.default_rng(state), color)) for calm in _CALM
     ]
 
 
@@ -241,15 +283,12 @@ def _config(
     return validate_config(data, "motion suggest")
 
 
-def _exposed(loaded: Any, config: Config, spline: Spline) -> tuple[Config, tuple[str, ...]]:
-    """The config with an exposure for the scene's light, where the one it has is far off, and a note on it."""
-    assert config.motion is not None
-    if not loaded.emitters():
-        return config, ("it has no light, and what it shows is black: add an emitter",)
-    gain = suggested_gain(
-        loaded, config.color.camera, spline.pose, config.motion.duration_s, config.color.exposure_gain
-    )
-    if gain is None:
-        return config, ()
-    color = config.color.model_copy(update={"exposure_gain": gain})
-    return config.model_copy(update={"color": color}), (f"its light asks for an exposure gain of {gain:g}",)
+def _exposed(config: Config, exposure: Exposure | None) -> Config:
+    """The config with the exposure of its tour; None: as it is."""
+    if exposure is None:
+        return config
+    change: dict[str, Any] = {"exposure_gain": exposure.gain}
+    if exposure.target is not None:
+        change["auto_exposure"] = AutoExposureConfig(target=exposure.target)
+        change["exposure_s"] = config.color.exposure_s or _LINE_S
+    return config.model_copy(update={"color": config.color.model_copy(update=change)})

@@ -1,4 +1,4 @@
-"""A tour that has been found: in words, how to expose it, and the unit that its scene may be in."""
+"""A tour that has been found, in words, and the unit that its scene may be in."""
 
 from __future__ import annotations
 
@@ -10,21 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.array_types import Float32Array, FloatArray
-from rsgen.device.pose_table import PoseFunction
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry.camera import Camera
-from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
 from rsgen.motion.statistics import motion_statistics
-from rsgen.motion.walk import ViewContents, free_region
-from rsgen.produce.camera_sources import small_camera
+from rsgen.motion.walk import free_region
+from rsgen.produce.views import MOST_CLIPPED, Exposure, Scores, Shine
 
 REACH_M = 1.0  # surfaces farther off are not reported
 _LARGEST_THING_M = 50.0
 _SEEN_M = (0.4, 5.0)
-_VIEWS = 40
+_VIEWS, _MOST_VIEWS = 20, 120
 _AS_WISHED = 1.1
 _EMPTY = 0.3
 
@@ -37,14 +34,16 @@ _SMALLEST_M = 0.001
 
 @dataclass(frozen=True, eq=False)
 class TourScene:
-    """A scene file's triangles (m, 3, 3), world, m, and rays into it. fineness (m,): how finely light is baked on each,
-    of what is asked. placed: fields of its config but the file. hint: what may be the matter where no tour is found.
+    """A scene file's triangles (m, 3, 3), world, m, rays into it and the light along them. fineness (m,): how finely
+    light is baked on each, of what is asked. placed: fields of its config but the file. hint: what may be the matter
+    where no tour is found.
     """
 
     file: Path
     triangles: FloatArray
     fineness: FloatArray
     cast: Cast
+    shine: Shine
     placed: Mapping[str, Any]
     hint: str = ""
 
@@ -113,22 +112,22 @@ def find_thing(scene: TourScene) -> Thing:
 
 @dataclass(frozen=True, eq=False)
 class Tour:
-    """A config's spline, how long it lasts, its least distance to surfaces in m, and what the camera sees along it."""
+    """A config's spline, how long it lasts, its least distance to surfaces in m, how far off the camera sees something
+    along it (n, pixels), m, how that is to be exposed (None: as it is), and how good it is then.
+    """
 
     spline: Spline
     seconds: float
     least: float
-    seen: ViewContents
-
-    @property
-    def flat(self) -> float:
-        """Share of the views that hold nothing but one plane."""
-        return float(np.mean(self.seen.flat))
+    distance: FloatArray
+    exposure: Exposure | None
+    scores: Scores
 
 
 def view_times(seconds: float) -> FloatArray:
     """Instants (n,) in s that views are looked at, over all of a made motion."""
-    return np.linspace(0.0, seconds, _VIEWS)
+    count = min(max(_VIEWS, math.ceil(seconds)), _MOST_VIEWS)
+    return np.asarray((np.arange(count) + 0.5) * (seconds / count), float)
 
 
 def room_text(plan: FloorPlan, clearance_m: float) -> str:
@@ -151,7 +150,7 @@ def thing_text(size: FloatArray) -> str:
 def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:
     """What the spline is like, and what its camera sees. rotation_deg_s: mean that was wished for, if any."""
     stats = motion_statistics(tour.spline, 0.0, tour.seconds)
-    distance, least = tour.seen.distance, tour.least
+    distance, least = tour.distance, tour.least
     near, far = _SEEN_M
     seen, nothing = np.mean((distance >= near) & (distance <= far)), np.mean(~np.isfinite(distance))
     lines = [
@@ -164,50 +163,24 @@ def motion_text(tour: Tour, rotation_deg_s: float | None) -> list[str]:
         lines.append(f"turns faster than the {rotation_deg_s:.0f} deg/s of the other: what it looks at asks for it")
     if nothing > _EMPTY:
         lines.append("much of the views is empty: a floor and walls would help a tracker")
-    if tour.flat > 0:
-        flat = f"one plane fills {100 * tour.flat:.0f} % of the views"
-        lines.append(f"{flat}: depth alone does not tell how the camera moves there")
+    if (flat := tour.scores.flat) > 0:
+        text = f"next to nothing but one plane in {100 * flat:.0f} % of the views"
+        lines.append(f"{text}: depth alone does not tell how the camera moves there")
+    lines.append(tour.scores.text())
+    clipped = float(tour.scores.clipped.mean())
+    if clipped > MOST_CLIPPED:
+        lines.append(f"no exposure keeps more than {100 * (1 - clipped):.0f} % of the pixels from clipping")
     return lines
 
 
-_GLANCES, _WIDTH, _SPP, _DEPTH = 6, 48, 32, 16
-_BLOCK = 12  # pixels: noise of so few samples is averaged over blocks
-_GREY = 0.18  # what half of the blocks are to be brighter than
-_MOST, _WHITE = 0.7, 0.6  # of the blocks, that are not to be brighter than this: windows may, white walls not
-_ENOUGH = 2.0  # a factor that is not worth the while
-
-
-def suggested_gain(scene: Any, camera: Camera, T_world_cam: PoseFunction, until_s: float, gain: float) -> float | None:
-    """`color.exposure_gain` that makes the typical surface mid-grey, or less where it would make most of a picture's
-    bright part white: dark floors below white walls. None if `gain` does so within a factor of 2.
-
-    Path traced by `camera`, made small, at poses T_world_cam(t), at a few instants from 0 to `until_s`, in s. None too
-    where all is dark.
-    """
-    import mitsuba as mi
-
-    from rsgen.light.lamps import straight_through_bulbs
-    from rsgen.render.images import ColorRenderer
-
-    path = mi.load_dict({"type": "path", "max_depth": _DEPTH})
-    renderer = ColorRenderer(scene, path, small_camera(camera, _WIDTH), Shutter(), _SPP)
-    stamps = until_s * (np.arange(_GLANCES) + 0.5) / _GLANCES
-    with straight_through_bulbs(scene):
-        light = np.concatenate([_blocks(renderer.render(T_world_cam, float(t), k)) for k, t in enumerate(stamps)])
-    light = light[light > 0]
-    if not len(light):
-        return None
-    wanted = min(_GREY / float(np.median(light)), _WHITE / float(np.quantile(light, _MOST)))
-    if 1 / _ENOUGH <= wanted / gain <= _ENOUGH:
-        return None
-    return float(f"{wanted:.2g}")
-
-
-def _blocks(image: Float32Array) -> FloatArray:
-    """Mean light (n,), all channels, of whole blocks of an image (h, w, 3)."""
-    rows, columns = (size // _BLOCK for size in image.shape[:2])
-    whole = image[: rows * _BLOCK, : columns * _BLOCK].reshape(rows, _BLOCK, columns, _BLOCK, 3)
-    return np.asarray(whole.mean(axis=(1, 3, 4), dtype=np.float64)).ravel()
+def exposure_text(exposure: Exposure | None) -> list[str]:
+    """How the config's light is exposed, where that is not as before."""
+    if exposure is None:
+        return []
+    gain = f"its light asks for an exposure gain of {exposure.gain:g}"
+    if exposure.target is None:
+        return [gain]
+    return [f"{gain}, and for automatic exposure: no single one shows both its dark and its bright places"]
 
 
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254}

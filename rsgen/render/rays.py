@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.device.arrays import rows_of, vectors
 
 RAY_OFFSET_M = 2e-4  # of rays that start on a surface: so far above it
@@ -27,6 +27,24 @@ def cast_rays(scene: Any, p_world: FloatArray, direction: FloatArray) -> tuple[F
     distance, normal = dr.select(valid, hit.t, dr.inf), dr.select(valid, hit.n, 0)
     dr.eval(distance, normal)
     return np.asarray(distance, float).reshape(-1), rows_of(normal).astype(float)
+
+
+def radiance_along(
+    scene: Any, integrator: Any, p_world: FloatArray, direction: FloatArray, spp: int, seed: int
+) -> Float32Array:
+    """Linear RGB (n, 3) from points (n, 3) along unit directions (n, 3), world frame: the mean of spp samples.
+
+    integrator: a Mitsuba sampling integrator. seed: of all its random numbers.
+    """
+    index = dr.arange(mi.UInt32, len(p_world) * spp) // spp
+    ray = rays_from(p_world, direction)
+    ray = mi.RayDifferential3f(mi.Ray3f(dr.gather(mi.Point3f, ray.o, index), dr.gather(mi.Vector3f, ray.d, index)))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(int(np.random.SeedSequence(seed).generate_state(1)[0]), dr.width(index))
+    light, _, _ = integrator.sample(scene, sampler, ray, None, mi.Bool(True))
+    light = mi.unpolarized_spectrum(light)
+    sums = mi.Color3f(*(dr.block_sum(dr.select(dr.isfinite(channel), channel, 0), spp) for channel in light))
+    return (rows_of(sums) / np.float32(spp)).astype(np.float32)
 
 
 def rays_from(p_world: npt.ArrayLike, direction: npt.ArrayLike) -> Any:

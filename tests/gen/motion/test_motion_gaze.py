@@ -6,35 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
-from rsgen.motion.walk import choose_targets, seen_from
-
-
-def test_a_view_of_one_plane_is_flat_and_one_of_a_corner_is_not() -> None:
-    """Rays into a wall 2 m ahead, and into that with another one to the right, by arithmetic."""
-
-    def cast(side_m: float) -> Any:
-        def into(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            with np.errstate(divide="ignore"):
-                ahead, right = (2 - origin[:, 2]) / direction[:, 2], (side_m - origin[:, 0]) / direction[:, 0]
-            right = np.where(right > 0, right, np.inf)
-            normal = np.where((ahead < right)[:, None], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0])
-            return np.minimum(ahead, right), normal
-
-        return into
-
-    poses = np.stack([np.eye(4)] * 3)
-    poses[1, 2, 3], poses[2, :3, :3] = 1.2, Rotation.from_euler("y", -20, degrees=True).as_matrix()
-    view = seen_from(poses, cast(np.inf))
-    assert view.flat.all()
-    assert view.distance[0].max() == pytest.approx(2 * math.sqrt(1 + 0.5266**2 + 0.3647**2), rel=1e-3)
-    # 0.7 m to the right: seen from 2 m, no more from 0.8 m nor by who looks left.
-    np.testing.assert_array_equal(seen_from(poses, cast(0.7)).flat, [False, True, True])
-    nothing = seen_from(poses, lambda o, d: (np.full(len(o), np.inf), np.tile([0.0, 0.0, -1.0], (len(o), 1))))
-    assert not nothing.flat.any()
+from rsgen.motion.walk import AZIMUTHS, ELEVATIONS_DEG, choose_targets
 
 
 def test_what_a_room_holds_is_looked_at_rather_than_its_bare_half() -> None:
@@ -54,7 +28,7 @@ def test_what_a_room_holds_is_looked_at_rather_than_its_bare_half() -> None:
     angle = np.linspace(0, math.tau, 16, endpoint=False)
     walk = np.stack([1.4 * np.cos(angle), np.full(16, 0.15), 1.4 * np.sin(angle)], axis=1)
 
-    def turned_there(*meshes: Any) -> float:
+    def turned_there(*meshes: Any, color: np.ndarray | None = None) -> float:
         mesh = trimesh.util.concatenate(meshes)
 
         def cast(origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,8 +38,16 @@ def test_what_a_room_holds_is_looked_at_rather_than_its_bare_half() -> None:
             normal[ray] = mesh.face_normals[face]
             return distance, normal
 
-        gaze = choose_targets(walk, cast, 0.2, np.random.default_rng(0)) - walk
+        place, target = choose_targets(walk, cast, 0.2, np.random.default_rng(0), color)
+        gaze = target - place
         return float(np.mean(gaze[:, 2] < 0))
 
     assert turned_there(room) < 0.6
     assert turned_there(room, *things) > 0.75
+    # Without them, were that wall painted: directions towards it have edges, the others none or are burnt out too.
+    azimuth = np.arange(AZIMUTHS) * (math.tau / AZIMUTHS)
+    color = np.zeros((2, 16, AZIMUTHS, len(ELEVATIONS_DEG)))
+    color[0, :, np.sin(azimuth) < -0.5] = 0.2
+    painted = turned_there(room, color=color)
+    color[1, :, np.sin(azimuth) > 0] = 0.3
+    assert turned_there(room) < painted and turned_there(room, color=color) > 0.75

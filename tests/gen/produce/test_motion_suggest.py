@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,10 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.statistics import motion_statistics
-from rsgen.motion.walk import seen_from
 from rsgen.produce.parts import TrueMotion, load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
-from rsgen.produce.tour import doubt, likely_unit
+from rsgen.produce.tour import doubt, likely_unit, view_times
+from rsgen.produce.views import path_traced, score, views_along
 from rsgen.render.rays import cast_rays
 from rsgen.render.scene import load_scene
 
@@ -94,9 +95,9 @@ def motion_of(config: Config) -> TrueMotion:
 
 
 def tour(file: Path, wish: Wish, **how: Any) -> Suggestion:
-    """What is suggested, but for the exposure, which is as long in the finding and has tests of its own."""
+    """What is suggested where light is the same all over: to trace it is as long, and has tests of its own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rsgen.produce.suggest.suggested_gain", lambda *_: None)
+        patch.setattr("rsgen.produce.suggest.path_traced", lambda _: lambda p, d, k: np.full((2, len(p), 3), 0.2))
         patch.setattr("rsgen.produce.suggest.load_motion", motion_of)
         return suggest_tour(file, None, wish, **how)
 
@@ -206,14 +207,20 @@ def test_where_a_way_sees_one_bare_wall_another_is_looked_for_or_it_is_said(
     loaded = load_scene(corridor)
 
     def flat(suggestion: Suggestion) -> tuple[float, list[str]]:
-        seen = seen_from(spline_of(suggestion).pose(np.linspace(0, 6, 40)), partial(cast_rays, loaded))
-        return float(np.mean(seen.flat)), [line for line in suggestion.found if line.startswith("one plane fills ")]
+        poses = spline_of(suggestion).pose(view_times(6.0))
+        views = views_along(poses, suggestion.config.color.camera, partial(cast_rays, loaded), path_traced(loaded))
+        share = score(views, np.ones(len(poses))).flat
+        return share, [line for line in suggestion.found if line.startswith("next to nothing but one plane ")]
 
     share, said = flat(tour(corridor, wish))
     assert share <= 0.1 and bool(said) == (share > 0)
-    monkeypatch.setattr("rsgen.produce.suggest._ATTEMPTS", 1)
-    share, said = flat(tour(corridor, wish))
-    assert share > 0.1 and said[0].startswith(f"one plane fills {100 * share:.0f} % of the views")
+
+    def half(*given: Any) -> Any:
+        views = views_along(*given)
+        return replace(views, shape=views.shape * (np.arange(len(views.shape)) % 2))
+
+    monkeypatch.setattr("rsgen.produce.suggest.views_along", half)
+    assert flat(tour(corridor, wish))[1][0].startswith("next to nothing but one plane in 50 % of the views")
 
 
 def test_a_seed_decides_every_byte(folder: Path) -> None:
