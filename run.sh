@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Set-up and the two commands of this project: ./run.sh demo, ./run.sh test (and ./run.sh setup alone, and for who
 # changes it ./run.sh bench smoke|gate|full and ./run.sh next).
-# Installs into .venv, and a libLLVM (17 or newer) from the system's packages if there is none. A second run is quick.
+# Installs into .venv, and a libLLVM (17 or newer) and libatomic from the system's packages where they are missing. A
+# second run is quick.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -50,6 +51,10 @@ setup() {
     [ -x .venv/bin/python ] || make_venv
     .venv/bin/python -m pip install --quiet --disable-pip-version-check -c .ci/requirements.lock -e '.[test]'
     echo "$want" >"$stamp"
+  fi
+  if ! .venv/bin/python -c 'import drjit' >/dev/null 2>&1; then
+    say "installing libatomic, which Dr.Jit needs, from the system's packages"
+    apt_install libatomic1 && .venv/bin/python -c 'import drjit' || die "Dr.Jit cannot be loaded: see above"
   fi
   if ! .venv/bin/python -m rsgen.device.backend >/dev/null 2>&1; then
     say "installing libLLVM from the system's packages"

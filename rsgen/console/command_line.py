@@ -207,6 +207,14 @@ def run_program(
             file=sys.stderr,
         )
         return 2
+    except NameError as error:  # Dr.Jit's way to fail where a library of the system is missing
+        if not isinstance(error.__context__, ImportError):
+            raise
+        said = f"Dr.Jit cannot be loaded ({error.__context__})"
+        print(
+            f"{name}: {said}: install that library (Debian/Ubuntu: 'sudo apt-get install libatomic1')", file=sys.stderr
+        )
+        return 2
     except BrokenPipeError:
         # Whoever read our output has seen enough; the interpreter would complain when it flushes the rest.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

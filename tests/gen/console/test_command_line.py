@@ -100,3 +100,20 @@ def test_a_package_that_is_missing_is_one_line(capfd: pytest.CaptureFixture[str]
     out, error = capfd.readouterr()
     assert out == "" and error.startswith("program: a-package-that-nobody-has is not installed for ")
     assert error.count("\n") == 1
+
+
+def test_a_library_that_dr_jit_lacks_is_one_line(capfd: pytest.CaptureFixture[str]) -> None:
+    """Regression: in a bare container Dr.Jit's own failure to fail hid what was missing."""
+
+    def like_dr_jit() -> Any:
+        try:
+            raise ImportError("libatomic.so.1: cannot open shared object file: No such file or directory")
+        except ImportError:
+            return _drjit_ext.__file__  # type: ignore[name-defined]  # noqa: F821
+
+    assert run_program("program", like_dr_jit, [], "") == 2
+    out, error = capfd.readouterr()
+    assert out == "" and error.startswith("program: Dr.Jit cannot be loaded (libatomic.so.1: ")
+    assert "apt-get install libatomic1" in error and error.count("\n") == 1
+    with pytest.raises(NameError):
+        run_program("program", lambda: nothing_of_that_name, [], "")  # type: ignore[name-defined]  # noqa: F821
