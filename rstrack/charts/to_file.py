@@ -90,7 +90,9 @@ def _draw_chart(axis: Any, chart: Chart, with_legend: bool = True) -> None:
         axis.set_xticks(x, chart.groups)
     if chart.is_log:
         axis.set_yscale("log")
+        low, high = axis.get_ylim()
         axis.yaxis.set_major_formatter(lambda value, _: f"{value:g}")  # no powers of ten
+        axis.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if high < 10.0 * low else "")
     elif chart.from_zero:
         axis.set_ylim(bottom=-0.14 * chart.highest if chart.ticks else 0.0, top=chart.y_max)
     axis.margins(x=0.01 if not any(line.has_points for line in chart.lines) else 0.05)

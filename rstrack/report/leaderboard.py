@@ -54,7 +54,7 @@ def leaderboard(scores: Scores) -> Page:
         sections.append(PageSection("gaps", "Not scored, and why", tuple(Note(line) for line in gaps)))
     return Page(
         title="Leaderboard",
-        subtitle=f"{words}: {len(suite.entries)} sequences, {len(scores.methods)} methods",
+        subtitle=f"{words}: sequences {len(suite.entries)}, methods {len(scores.methods)}",
         cards=(),
         sections=tuple(sections),
         warnings=() if not gaps else (f"Not scored: {len(gaps)}. The end of the page says what, and why.",),
