@@ -19,8 +19,8 @@ from rsgen.geometry.camera import Camera
 from rsgen.motion.floor_plan import Cast
 from rsgen.produce.camera_sources import small_camera
 
-Shine = Callable[[FloatArray, FloatArray, int], Float32Array]
-"""From points (n, 3) along unit directions (n, 3), with a seed: linear radiance (2, n, 3), independent halves."""
+Shine = Callable[[FloatArray, FloatArray], Float32Array]
+"""From points (n, 3), m, along unit directions (n, 3), world: linear radiance (2, n, 3), independent halves."""
 
 MOST_CLIPPED = 0.02
 """Of a tour's pixels, that may be white in a channel."""
@@ -94,7 +94,7 @@ class Scores:
 
     @property
     def worst(self) -> float:
-        """Mean worth of the worst tenth of the views: by this tours are compared."""
+        """Mean worth of the worst tenth of the views."""
         return float(np.sort(self.worth)[: max(1, round(_WORST * len(self.worth)))].mean())
 
     def text(self) -> str:
@@ -120,7 +120,7 @@ class Scores:
 
 
 def views_along(T_world_cam: FloatArray, camera: Camera, cast: Cast, shine: Shine) -> Views:
-    """What the camera, made small, sees at poses (n, 4, 4)."""
+    """What the camera, made small, sees at poses (n, 4, 4), m."""
     small = small_camera(camera, _WIDTH)
     rays = small.unproject(small.pixel_grid())
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -133,7 +133,7 @@ def views_along(T_world_cam: FloatArray, camera: Camera, cast: Cast, shine: Shin
     p = np.where(np.isfinite(distance), distance, 0.0)[:, None] * direction
     seen = zip(p.reshape(*shape, 3), normal.reshape(*shape, 3), distance.reshape(shape), strict=True)
     constraint = np.array([_constraint(p, n, d < _FAR_M) for p, n, d in seen])
-    light = shine(origin, direction, 0).reshape(2, len(T_world_cam), *rays.shape)
+    light = shine(origin, direction).reshape(2, len(T_world_cam), *rays.shape)
     return Views(_smoothed(light), constraint, distance.reshape(shape))
 
 
@@ -189,10 +189,11 @@ def suggested_exposure(light: Float32Array, gain: float) -> Exposure | None:
     wanted = min(typical, most)
     dark = float((peak * wanted < _DARK).mean())
     for target in _TARGETS if dark > _MUCH_DARK else ():
-        exposed = peak * adapted(light, target)[:, None, None]
+        gains = adapted(light, target)
+        exposed = peak * gains[:, None, None]
         if (exposed > 1).mean() <= _AIMED * MOST_CLIPPED:
             if (exposed < _DARK).mean() < _LIGHTER * dark:
-                return Exposure(float(f"{np.median(adapted(light, target)):.2g}"), target)
+                return Exposure(float(f"{np.median(gains):.2g}"), target)
             break
     if 1 / _ENOUGH <= wanted / gain <= _ENOUGH and gain <= most:
         return None
@@ -240,7 +241,7 @@ def plainness(p_world: FloatArray, shine: Shine, azimuths: int, elevations_deg: 
     level = np.cos(elevation)
     rays = np.stack([level * np.cos(azimuth), np.sin(elevation), level * np.sin(azimuth)], axis=-1)
     flat = np.tile(rays.reshape(-1, 3), (len(p_world), 1))
-    light = shine(np.repeat(p_world, rays[..., 0].size, axis=0), flat, 0).reshape(2, len(p_world), *rays.shape)
+    light = shine(np.repeat(p_world, rays[..., 0].size, axis=0), flat).reshape(2, len(p_world), *rays.shape)
     light = _smoothed(light)
     gain = _typical_gain(light)
     exposed = light * np.float32(1.0 if gain is None else gain)
@@ -258,9 +259,9 @@ def path_traced(scene: Any) -> Shine:
 
     integrator = mi.load_dict({"type": "path", "max_depth": _DEPTH})
 
-    def shine(p_world: FloatArray, direction: FloatArray, seed: int) -> Float32Array:
+    def shine(p_world: FloatArray, direction: FloatArray) -> Float32Array:
         with straight_through_bulbs(scene):
-            halves = [radiance_along(scene, integrator, p_world, direction, _SPP, 2 * seed + k) for k in range(2)]
+            halves = [radiance_along(scene, integrator, p_world, direction, _SPP, seed) for seed in range(2)]
         return np.stack(halves)
 
     return shine

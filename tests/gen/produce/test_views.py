@@ -27,7 +27,7 @@ def cast_into(mesh: trimesh.Trimesh) -> Any:
     return cast
 
 
-def grey(p: np.ndarray, direction: np.ndarray, seed: int) -> np.ndarray:
+def grey(p: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.full((2, len(p), 3), 0.2, np.float32)
 
 
