@@ -97,7 +97,7 @@ def motion_of(config: Config) -> TrueMotion:
 def tour(file: Path, wish: Wish, **how: Any) -> Suggestion:
     """What is suggested where light is the same all over: to trace it is as long, and has tests of its own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("rsgen.produce.suggest.path_traced", lambda _: lambda p, d, k: np.full((2, len(p), 3), 0.2))
+        patch.setattr("rsgen.produce.suggest.path_traced", lambda _: lambda p, d: np.full((2, len(p), 3), 0.2))
         patch.setattr("rsgen.produce.suggest.load_motion", motion_of)
         return suggest_tour(file, None, wish, **how)
 
