@@ -115,11 +115,14 @@ def recorded_from(inputs: type[Inputs]) -> Callable[[Callable[[Inputs], Any]], C
     return decorate
 
 
-def recorded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of Dr.Jit arrays, traced on its first call with arguments of a kind and replayed on the others."""
+def recorded(function: Callable[..., Any], state: Callable[..., Any] | None = None) -> Callable[..., Any]:
+    """`function` of Dr.Jit arrays, traced on its first call with arguments of a kind and replayed on the others.
+
+    state: of the same arguments, what else on the device it depends on.
+    """
     import drjit as dr
 
-    frozen = dr.freeze(function)
+    frozen = dr.freeze(function, state_fn=state)
 
     @wraps(function)
     def call(*args: Any) -> Any:

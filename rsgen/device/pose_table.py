@@ -31,7 +31,7 @@ class PoseTable:
 
     rows: Any
     steps: int
-    step_s: float
+    step_s: Any  # a number, or one on the device
     vector: Any
 
     @staticmethod

@@ -13,17 +13,20 @@ import mitsuba as mi
 import numpy as np
 
 from rsgen.array_types import Float32Array, UInt16Array
+from rsgen.device.arrays import recorded
 from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.moving_objects import MovingObjects
+from rsgen.render.pixel_samples import PixelSamples
 from rsgen.render.sensor import RollingShutterSensor
 
 # Samples in one launch; more are rendered in several and averaged, which bounds memory.
 _LAUNCH = 1 << 24
-# Steps of the R3 low-discrepancy sequence (Roberts 2018) over footprint x, footprint y and exposure time.
-_R3 = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+# First dimensions of a sample's numbers, two each but for the time of exposure: the place in the pixel's footprint,
+# what is matte beneath gloss, the lobe that is looked along, the place on lamps that are mirrored.
+_PLACE, _TIME, _MATTE, _LOBE, _LAMPS, _DIMENSIONS = 0, 2, 3, 5, 7, 9
 
 
 class ColorRenderer:
@@ -40,6 +43,8 @@ class ColorRenderer:
         self._sampler = mi.load_dict({"type": "independent"})
         self.sensor = RollingShutterSensor(camera, shutter)
         self._objects = integrator.objects if isinstance(integrator, BakedIntegrator) else None
+        self._samples = PixelSamples(spp, _DIMENSIONS)
+        self._replayed = recorded(self._direct, self._state), recorded(self._traced, self._state)
 
     def render(
         self, T_world_cam: PoseFunction, stamp: float, seed: int, exposure_s: float | None = None
@@ -65,52 +70,79 @@ class ColorRenderer:
         # Mixed on the host: neighbouring seeds must not give neighbouring random streams. All launches of a frame go on
         # with one sequence of positions and times; only the integrator's own random numbers start anew.
         states = (np.random.SeedSequence([seed, k]).generate_state(2) for k in (0, first))
-        rotation, sampler_key = (dr.opaque(mi.UInt32, int(state[k])) for k, state in enumerate(states))
+        key, sampler_key = (dr.opaque(mi.UInt32, int(state[k])) for k, state in enumerate(states))
         start = dr.opaque(mi.UInt32, first)
         index = dr.arange(mi.UInt32, pixels * count)
         if isinstance(self._integrator, BakedIntegrator):
-            u = self._spread(index, count, start, rotation, len(_R3), 2)
-            ray = mi.Ray3f(self._rays(index, count, start, rotation))
-            radiance, rest = self._integrator.matte(self._scene, ray, mi.Point2f(*u))
-            # Evenly spread samples stand for all of them, whatever they show: no bias, but more noise.
-            step = max(1, self._spp // self._integrator.glossy_spp)
-            rest &= (index % count + start) % step == 0
-            stands_for = self._spp / len(range(0, self._spp, step))
-            dr.eval(radiance, rest)
-            index = dr.compress(rest)
+            *radiance, rest = self._run(0, index, start, key, count)
+            # The first samples stand for all of them, whatever they show: no bias, but more noise.
+            mirrored = min(self._spp, self._integrator.glossy_spp)
+            index = dr.compress(rest & (index % count + start < mirrored))
+            if dr.width(index) > 0:
+                traced = self._run(1, index, start, key, sampler_key, count)
+                for channel, values in zip(radiance, traced, strict=True):
+                    dr.scatter_add(channel, values * (self._spp / mirrored), index, mode=dr.ReduceMode.NoConflicts)
         else:
-            radiance = dr.zeros(mi.Color3f, pixels * count)
-        if dr.width(index) > 0:
-            self._sampler.seed(sampler_key, dr.width(index))
-            ray = self._rays(index, count, start, rotation)
-            ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
-            if isinstance(self._integrator, BakedIntegrator):
-                number = (index % count + start) // step
-                scramble = [mi.sample_tea_32(index // count, rotation + len(_R3) + 2 + k, 4)[0] for k in range(4)]
-                traced = self._integrator.spread(self._scene, self._sampler, ray, number, scramble)
-                traced = dr.gather(mi.Color3f, radiance, index) + stands_for * traced
-            else:
-                traced, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
-            dr.scatter(radiance, mi.unpolarized_spectrum(traced), index)
+            self._sampler.seed(sampler_key, pixels * count)
+            ray = self._rays(index, start, key, count)
+            traced, _, _ = self._integrator.sample(self._scene, self._sampler, ray, None, mi.Bool(True))
+            radiance = list(mi.unpolarized_spectrum(traced))
+        dr.eval(radiance)
         sums = [dr.block_sum(channel, count) for channel in radiance]
         dr.eval(sums)
         return np.stack([np.asarray(s) for s in sums], axis=1)
 
-    @staticmethod
-    def _spread(index: Any, count: int, start: Any, rotation: Any, first: int, dimensions: int) -> list[Any]:
-        """Uniform numbers, evenly spread over each pixel's samples; first: the first of their dimensions."""
-        pixel = index // count
-        sample = mi.Float(index - pixel * count + start)
-        return [_fraction(sample * _R3[k] + _hash(pixel, rotation, first + k)) for k in range(dimensions)]
+    def _run(self, number: int, *args: Any) -> Any:
+        """`_direct` (0) or `_traced` (1) of `args`, as recorded: tracing takes longer than small pictures do."""
+        if self._objects is not None:  # whose poses the recording does not know
+            return (self._direct, self._traced)[number](*args)
+        try:
+            return self._replayed[number](*args)
+        except RuntimeError:
+            # Meshes build what samples of lamps are drawn by at first use, which a recording must not meet.
+            dr.eval(self._scene.sample_emitter_direction(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Point2f(0.5), False))
+            return self._replayed[number](*args)
 
-    def _rays(self, index: Any, count: int, start: Any, rotation: Any) -> Any:
-        """Camera rays of samples `index` of a launch: `count` neighbours share a pixel."""
+    def _state(self, *_: Any) -> list[Any]:
+        """All on the device that a frame's colours depend on, beside what is handed over."""
+        field = self._integrator.state if isinstance(self._integrator, BakedIntegrator) else []
+        # A pointer of a kind makes Dr.Jit look at all objects of that kind, those of other scenes too, as its calls do.
+        shape = mi.ShapePtr(self._scene.shapes()[0])
+        kinds = [shape, shape.bsdf(), *(mi.EmitterPtr(e) for e in self._scene.emitters()[:1]), self._scene]
+        return [*kinds, *field, *self.sensor.state, *self._samples.table]
+
+    def _direct(self, index: Any, start: Any, key: Any, count: int) -> list[Any]:
+        """Red, green, blue of samples `index` of a launch but for what surfaces mirror, and where they mirror."""
+        ray = mi.Ray3f(self._rays(index, start, key, count))
+        u = mi.Point2f(*self._numbers(index, start, key, count, _MATTE, 2))
+        radiance, rest = self._integrator.matte(self._scene, ray, u)
+        dr.eval(radiance, rest)
+        return [*radiance, rest]
+
+    def _traced(self, index: Any, start: Any, key: Any, sampler_key: Any, count: int) -> list[Any]:
+        """Red, green, blue of what surfaces mirror in samples `index` of a launch."""
+        sampler = self._sampler.clone()
+        sampler.seed(sampler_key, dr.width(index))
+        ray = self._rays(index, start, key, count)
+        ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
+        lobe, lamps = (mi.Point2f(*self._numbers(index, start, key, count, k, 2)) for k in (_LOBE, _LAMPS))
+        radiance = self._integrator.mirrored(self._scene, sampler, ray, lobe, lamps)
+        dr.eval(radiance)
+        return list(radiance)
+
+    def _numbers(self, index: Any, start: Any, key: Any, count: int, first: int, dimensions: int) -> list[Any]:
+        """Of samples `index` of a launch, `count` neighbours of which share a pixel."""
+        pixel = index // count
+        return self._samples.at(index - pixel * count + start, pixel, key, first, dimensions)
+
+    def _rays(self, index: Any, start: Any, key: Any, count: int) -> Any:
+        """Camera rays of samples `index` of a launch."""
         camera = self.sensor.camera
         pixel = index // count
-        u, v, w = self._spread(index, count, start, rotation, 0, 3)
+        u, v = self._numbers(index, start, key, count, _PLACE, 2)
         x, y = mi.Float(pixel % camera.width) + u, mi.Float(pixel // camera.width) + v
         position = mi.Point2f(x / camera.width, y / camera.height)
-        time = w * self.sensor.shutter.exposure_s
+        time = self._numbers(index, start, key, count, _TIME, 1)[0] * self.sensor.exposure
         return self.sensor.sample_ray_differential(time, mi.Float(0), position, mi.Point2f(0.5))[0]
 
 
@@ -173,11 +205,3 @@ class DepthRenderer:
 def global_shutter(shutter: Shutter) -> Shutter:
     """The same shutter with all lines at once."""
     return replace(shutter, readout_s=0.0)
-
-
-def _fraction(x: Any) -> Any:
-    return x - dr.floor(x)
-
-
-def _hash(pixel: Any, key: Any, dimension: int) -> Any:
-    return mi.sample_tea_float32(pixel, key + dimension, 4)

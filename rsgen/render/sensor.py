@@ -17,6 +17,7 @@ Importing this module needs an active Mitsuba variant (`rsgen.device.backend.mit
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -56,12 +57,20 @@ class RollingShutterSensor(mi.Sensor):
     def expose(self, T_world_cam: PoseFunction, stamp: float, exposure_s: float | None = None) -> None:
         """Take the next frame at `stamp` (s) along `T_world_cam`: times (n,) s → (n, 4, 4), e.g. `Spline.pose`.
 
-        exposure_s: t_e from this frame on, where it is another one (kernels are compiled once for each). Times from
+        exposure_s: t_e from this frame on, where it is another one. Times from
         stamp − t_e to stamp + t_r are asked for; that may raise UserError if the trajectory ends before.
         """
         if exposure_s is not None:
             self.shutter = replace(self.shutter, exposure_s=exposure_s)
-        self._poses = PoseTable.of(mi.Vector4f, self.camera, self.shutter, T_world_cam, stamp)
+        table = PoseTable.of(mi.Vector4f, self.camera, self.shutter, T_world_cam, stamp)
+        # Numbers that an automatic exposure changes are data, else kernels would be compiled for each frame.
+        self.exposure = dr.opaque(mi.Float, self.shutter.exposure_s)
+        self._poses = replace(table, step_s=dr.opaque(mi.Float, table.step_s))
+
+    @property
+    def state(self) -> list[Any]:
+        """All on the device that rays depend on."""
+        return [self._poses.rows, self._poses.step_s, self.exposure]
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
         """Rays through film positions `sample2` in [0, 1]², at `time` in [0, t_e] after their line's shutter opened."""
@@ -80,7 +89,7 @@ class RollingShutterSensor(mi.Sensor):
         ray = dr.zeros(mi.RayDifferential3f)
         ray.o = origin
         ray.d = rotate(dr.normalize(self._direction(u, v)))
-        ray.time = t - shutter.exposure_s
+        ray.time = t - self.exposure
         ray.maxt = dr.largest(mi.Float)
         ray.wavelengths = wavelengths
         ray.o_x = ray.o_y = ray.o

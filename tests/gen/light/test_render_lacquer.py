@@ -21,6 +21,7 @@ from rsgen.light.sampling import in_channels
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field
+from rsgen.render.pixel_samples import PixelSamples
 
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -117,8 +118,10 @@ def test_samples_of_a_pixel_spread_evenly_over_a_lobe(tmp_path: Path) -> None:
     ray = mi.Ray3f(ray.o + dr.zeros(mi.Vector3f, pixels * spp), ray.d + dr.zeros(mi.Vector3f, pixels * spp))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, pixels * spp)
-    scramble = list(map(mi.UInt32, np.random.default_rng(2).integers(1 << 32, size=(4, pixels)).repeat(spp, axis=1)))
-    spread = np.array(baked.spread(scene, sampler, ray, mi.UInt32(number), scramble))[0]
+    pixel = np.arange(pixels, dtype=np.uint32).repeat(spp)
+    numbers = PixelSamples(spp, 9).at(mi.UInt32(number), mi.UInt32(pixel), mi.UInt32(2), 5, 4)
+    lobe, lamps = mi.Point2f(*numbers[:2]), mi.Point2f(*numbers[2:])
+    spread = np.array(baked.mirrored(scene, sampler, ray, lobe, lamps))[0]
     independent = np.array(baked.sample(scene, sampler, ray)[0])[0]
     means = [values.reshape(pixels, spp).mean(axis=1) for values in (spread, independent)]
     assert means[0].mean() == pytest.approx(means[1].mean(), rel=0.02)
