@@ -167,7 +167,6 @@ class DepthRenderer:
         """instances: `rsgen.truth.instances.Instances` of the scene, where labels are asked for."""
         self._scene, self._instances = scene, instances
         self.sensor = RollingShutterSensor(camera, shutter)
-        self._exposure = shutter.exposure_s
         self._objects = objects
 
     def render(self, T_world_cam: PoseFunction, stamp: float) -> Float32Array:
@@ -181,7 +180,7 @@ class DepthRenderer:
         pixel = dr.arange(mi.UInt32, camera.width * camera.height)
         u, v = mi.Float(pixel % camera.width), mi.Float(pixel // camera.width)
         position = mi.Point2f((u + 0.5) / camera.width, (v + 0.5) / camera.height)
-        ray, _ = self.sensor.sample_ray(0.5 * self._exposure, mi.Float(0), position, mi.Point2f(0.5))
+        ray, _ = self.sensor.sample_ray(0.5 * self.sensor.exposure, mi.Float(0), position, mi.Point2f(0.5))
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
         shape = camera.height, camera.width
         label = mi.UInt32(0) if self._instances is None else self._instances.seen_by(hit)

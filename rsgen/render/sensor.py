@@ -63,14 +63,15 @@ class RollingShutterSensor(mi.Sensor):
         if exposure_s is not None:
             self.shutter = replace(self.shutter, exposure_s=exposure_s)
         table = PoseTable.of(mi.Vector4f, self.camera, self.shutter, T_world_cam, stamp)
-        # Numbers that an automatic exposure changes are data, else kernels would be compiled for each frame.
-        self.exposure = dr.opaque(mi.Float, self.shutter.exposure_s)
-        self._poses = replace(table, step_s=dr.opaque(mi.Float, table.step_s))
+        # Numbers that frames and sequences differ in are data, else kernels would be compiled for each.
+        times = self.shutter.exposure_s, self.shutter.line_delay(self.camera), table.step_s
+        self.exposure, self._line_delay, step = (dr.opaque(mi.Float, t) for t in times)
+        self._poses = replace(table, step_s=step)
 
     @property
     def state(self) -> list[Any]:
         """All on the device that rays depend on."""
-        return [self._poses.rows, self._poses.step_s, self.exposure]
+        return [self._poses.rows, self._poses.step_s, self.exposure, self._line_delay]
 
     def sample_ray(self, time, sample1, sample2, sample3, active=True):
         """Rays through film positions `sample2` in [0, 1]², at `time` in [0, t_e] after their line's shutter opened."""
@@ -79,10 +80,10 @@ class RollingShutterSensor(mi.Sensor):
 
     def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
         """Rays and unit weights; the ray's `time` is seconds after the stamp."""
-        camera, shutter = self.camera, self.shutter
+        camera = self.camera
         u = sample2.x * camera.width - 0.5
         v = sample2.y * camera.height - 0.5
-        t = time + self._line(u, v) * shutter.line_delay(camera)
+        t = time + self._line(u, v) * self._line_delay
         origin, rotate = self._pose(t)
 
         wavelengths, weight = self.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), sample1, active)
@@ -102,7 +103,7 @@ class RollingShutterSensor(mi.Sensor):
         """The camera's x, y and z axes in the world at `time` after the lines at film positions `sample2` opened."""
         camera = self.camera
         line = self._line(sample2.x * camera.width - 0.5, sample2.y * camera.height - 0.5)
-        _, rotate = self._pose(time + line * self.shutter.line_delay(camera))
+        _, rotate = self._pose(time + line * self._line_delay)
         return tuple(rotate(mi.Vector3f(*axis)) for axis in np.eye(3).tolist())
 
     def planar_depth_scale(self, u, v):

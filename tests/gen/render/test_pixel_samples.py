@@ -143,13 +143,18 @@ def test_frames_of_scenes_that_come_and_go(lacquered: Any, tmp_path: Path, monke
     np.testing.assert_array_equal(renderer.render(MOTION, 0.1, 3), before)
 
 
-def test_exposures_and_frames_share_their_kernels(lacquered: Any) -> None:
-    """An automatic camera has another exposure in each frame, and would compile for each."""
-    renderer = _renderer(lacquered)
-    renderer.render(MOTION, 0.1, 3, 0.008)
+def test_exposures_and_readouts_share_their_kernels(lacquered: Any) -> None:
+    """An automatic camera has another exposure in each frame, a sweep another readout in each sequence."""
+
+    def renderer(readout: float) -> ColorRenderer:
+        return ColorRenderer(*lacquered, Camera(24, 16, 20.0, 20.0, 11.5, 7.5), Shutter(readout, 0.01), 4)
+
+    renderer(0.02).render(MOTION, 0.1, 3, 0.008)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        for k in range(3):
-            renderer.render(MOTION, 0.1 * k, k, 0.001 * (k + 1))
+        for k, readout in enumerate((0.01, 0.028)):
+            other = renderer(readout)
+            for frame in range(2):
+                other.render(MOTION, 0.1 * frame, frame, 0.001 * (k + frame + 1))
         compiled = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
     assert compiled and all(entry["cache_hit"] and not entry["cache_disk"] for entry in compiled)
