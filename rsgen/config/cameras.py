@@ -235,7 +235,12 @@ class StreamConfig(Section):
 class ColorConfig(StreamConfig):
     """The colour camera."""
 
-    spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel (footprint and exposure window)")
+    spp: int = Field(
+        default=16,
+        ge=1,
+        le=65536,
+        description="samples per pixel (footprint and exposure window): 8 without blur, 16 to 32 with it; a power of 2",
+    )
     exposure_gain: Annotated[float, limits(1e-6, 1e6, "(factor)")] = Field(
         default=1.0, description="factor on linear radiance before sRGB quantisation"
     )
