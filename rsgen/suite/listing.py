@@ -11,8 +11,8 @@ from rsgen.console.tables import Table
 from rsgen.sequence.trajectory import read_trajectory
 from rsgen.suite.definition import Definition, Entry
 
-# Of lr_kt2 at 640x480 and 16 spp, everything written, on two cores with nothing else to do (0.28 s a frame): seconds.
-_S_PER_SAMPLE, _S_PER_DEPTH = 5.7e-8, 3e-7
+# Seconds on two slow cores, everything written (docs/notebook/rendering.md): a sample, a depth, an image, a sequence.
+_S_PER_SAMPLE, _S_PER_DEPTH, _S_PER_IMAGE, _S_PER_SEQUENCE = 1.2e-7, 3e-7, 0.05, 3.0
 # A pixel's bytes, of colour and of depth with its exact image; of the poses of a line; of the scene's surface.
 _BYTES_PER_COLOR, _BYTES_PER_DEPTH, _BYTES_PER_LINE, _BYTES_OF_SCENE = 1.7, 4.1, 56.0, 7.1e6
 
@@ -38,17 +38,17 @@ def estimate(configs: Iterable[Config]) -> Estimate:
     """By the number of pixels and samples alone: other scenes and machines differ by a factor of two or three."""
     frames, seconds, size, baked = 0, 0.0, 0.0, set()
     for config in configs:
-        lasts, size = _duration(config), size + _BYTES_OF_SCENE
+        lasts, size, seconds = _duration(config), size + _BYTES_OF_SCENE, seconds + _S_PER_SEQUENCE
         baked.add(f"{config.scene} {config.light}")
         for camera in config.cameras.values():
             count, pixels = int((lasts - camera.offset_s) * camera.rate_hz + 1e-6) + 1, camera.width * camera.height
             frames, size = frames + count, size + count * camera.height * _BYTES_PER_LINE
             if isinstance(camera, ColorConfig):
                 images = 1 + len(config.truth.images)
-                seconds += count * images * pixels * camera.spp * _S_PER_SAMPLE
+                seconds += count * images * (_S_PER_IMAGE + pixels * camera.spp * _S_PER_SAMPLE)
                 size += count * images * pixels * _BYTES_PER_COLOR
             else:
-                seconds += count * pixels * _S_PER_DEPTH
+                seconds += count * (_S_PER_IMAGE + pixels * _S_PER_DEPTH)
                 size += count * pixels * _BYTES_PER_DEPTH
     return Estimate(frames, seconds, size, len(baked))
 
