@@ -49,7 +49,7 @@ _PAPERS = (
 _WORDS = f"""\
 ATE and drift over a second are RMSE, means over seeds; counts are sums. † frames were lost; silent: frames given, not \
 lost, though 20 mm or 2° off. NEES/6 is 1 where errors are as large as covariances say, and 90 % should lie in 90 %. \
-{_PAPERS}"""
+All is computed by the `llvm` backend: no GPU has run a cell. {_PAPERS}"""
 _CASE = re.compile(r"readout-(.+)-(\d+(?:\.\d+)?)ms")
 _WHAT = {
     "rs-pg": "rolling shutter, depth and colour",
