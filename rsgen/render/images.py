@@ -93,20 +93,20 @@ class ColorRenderer:
         return np.stack([np.asarray(s) for s in sums], axis=1)
 
     def _run(self, number: int, *args: Any) -> Any:
-        """`_direct` (0) or `_traced` (1) of `args`, as recorded: tracing takes longer than small pictures do."""
-        if self._objects is not None:  # whose poses the recording does not know
+        """`_direct` (0) or `_traced` (1) of `args`, replayed: to trace them anew takes longer than a small picture."""
+        if self._objects is not None:  # their poses are not part of the recording
             return (self._direct, self._traced)[number](*args)
         try:
             return self._replayed[number](*args)
         except RuntimeError:
-            # Meshes build what samples of lamps are drawn by at first use, which a recording must not meet.
+            # A mesh builds the table that its light is sampled by at first use, which cannot be recorded: now, then.
             dr.eval(self._scene.sample_emitter_direction(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Point2f(0.5), False))
             return self._replayed[number](*args)
 
     def _state(self, *_: Any) -> list[Any]:
-        """All on the device that a frame's colours depend on, beside what is handed over."""
+        """All on the device that a frame's colours depend on, beside the arguments."""
         field = self._integrator.state if isinstance(self._integrator, BakedIntegrator) else []
-        # A pointer of a kind makes Dr.Jit look at all objects of that kind, those of other scenes too, as its calls do.
+        # A pointer makes Dr.Jit look at all objects of its class, those of other scenes too, as a virtual call does.
         shape = mi.ShapePtr(self._scene.shapes()[0])
         kinds = [shape, shape.bsdf(), *(mi.EmitterPtr(e) for e in self._scene.emitters()[:1]), self._scene]
         return [*kinds, *field, *self.sensor.state, *self._samples.table]
@@ -124,7 +124,6 @@ class ColorRenderer:
         sampler = self._sampler.clone()
         sampler.seed(sampler_key, dr.width(index))
         ray = self._rays(index, start, key, count)
-        ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
         lobe, lamps = (mi.Point2f(*self._numbers(index, start, key, count, k, 2)) for k in (_LOBE, _LAMPS))
         radiance = self._integrator.mirrored(self._scene, sampler, ray, lobe, lamps)
         dr.eval(radiance)
@@ -143,7 +142,9 @@ class ColorRenderer:
         x, y = mi.Float(pixel % camera.width) + u, mi.Float(pixel // camera.width) + v
         position = mi.Point2f(x / camera.width, y / camera.height)
         time = self._numbers(index, start, key, count, _TIME, 1)[0] * self.sensor.exposure
-        return self.sensor.sample_ray_differential(time, mi.Float(0), position, mi.Point2f(0.5))[0]
+        ray = self.sensor.sample_ray_differential(time, mi.Float(0), position, mi.Point2f(0.5))[0]
+        ray.scale_differential(mi.Float(1.0 / np.sqrt(self._spp)))
+        return ray
 
 
 class DepthCast(NamedTuple):

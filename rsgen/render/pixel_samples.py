@@ -1,7 +1,7 @@
-"""Numbers in [0, 1) for the samples of a pixel: Sobol's sequence, whose scrambling is each pixel's own.
+"""Numbers in [0, 1) for the samples of a pixel: Sobol's sequence, scrambled by Owen's method for each pixel.
 
-The first 2^n samples of a pixel stand evenly, in every pair of neighbouring dimensions from an even one on the better
-the smaller their numbers are. An edge or a texture in a pixel then errs with n^-1.5, not n^-1 (Mitchell 1996).
+The first 2^n samples of a pixel are stratified in each dimension, and in the first two together. Where an edge crosses
+the pixel their squared error falls with n^-1.5, that of random ones with n^-1 (Mitchell 1996).
 
 Importing this module needs an active Mitsuba variant (`rsgen.device.backend.mitsuba()`).
 """
