@@ -166,6 +166,10 @@ def row_renderer(scene: Any, integrator: Any, camera: Any, spp: int) -> Any:
 
         row = mi.Float(0)
 
+        @property
+        def state(self) -> list[Any]:
+            return [*super().state, self.row]
+
         def _direction(self, u: Any, v: Any) -> Any:
             return super()._direction(u, v + self.row)
 
