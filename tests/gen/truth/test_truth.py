@@ -80,7 +80,7 @@ def test_twins_are_taken_at_their_instants(scene: Any, scan: Any) -> None:
 def test_twins_have_the_frames_exposure_and_noise_of_their_own(scene: Any) -> None:
     shutter = Shutter(0.028, 0.01)
     color = stream(CAMERA, shutter).model_copy(update={"exposure_gain": 0.6})
-    truth = TruthConfig(sharp=True, global_shutter=("first", "middle"), spp=16)
+    truth = TruthConfig(sharp=True, global_shutter=("first", "middle"), spp=4)
     renderer = TruthRenderer(scene, emission_integrator(), color, truth)
     still = constant_twist(np.zeros(6), motion(np.array([STAMP]))[0])
     images, again, other = (renderer.render(still, STAMP, None, seed) for seed in (1, 1, 2))
