@@ -5,6 +5,7 @@ Pixels are summed in a fixed order (no atomics), so the same frame is the same t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -44,7 +45,7 @@ class ColorRenderer:
         self.sensor = RollingShutterSensor(camera, shutter)
         self._objects = integrator.objects if isinstance(integrator, BakedIntegrator) else None
         self._samples = PixelSamples(spp, _DIMENSIONS)
-        self._replayed = recorded(self._direct, self._state), recorded(self._traced, self._state)
+        self._replay_direct, self._replay_traced = self._replayed(self._direct), self._replayed(self._traced)
 
     def render(
         self, T_world_cam: PoseFunction, stamp: float, seed: int, exposure_s: float | None = None
@@ -74,12 +75,12 @@ class ColorRenderer:
         start = dr.opaque(mi.UInt32, first)
         index = dr.arange(mi.UInt32, pixels * count)
         if isinstance(self._integrator, BakedIntegrator):
-            *radiance, rest = self._run(0, index, start, key, count)
+            *radiance, rest = self._replay_direct(index, start, key, count)
             # The first samples stand for all of them, whatever they show: no bias, but more noise.
             mirrored = min(self._spp, self._integrator.glossy_spp)
             index = dr.compress(rest & (index % count + start < mirrored))
             if dr.width(index) > 0:
-                traced = self._run(1, index, start, key, sampler_key, count)
+                traced = self._replay_traced(index, start, key, sampler_key, count)
                 for channel, values in zip(radiance, traced, strict=True):
                     dr.scatter_add(channel, values * (self._spp / mirrored), index, mode=dr.ReduceMode.NoConflicts)
         else:
@@ -92,16 +93,23 @@ class ColorRenderer:
         dr.eval(sums)
         return np.stack([np.asarray(s) for s in sums], axis=1)
 
-    def _run(self, number: int, *args: Any) -> Any:
-        """`_direct` (0) or `_traced` (1) of `args`, replayed: to trace them anew takes longer than a small picture."""
+    def _replayed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """`function`, traced once and then replayed: to trace it for each frame takes longer than a small picture."""
         if self._objects is not None:  # their poses are not part of the recording
-            return (self._direct, self._traced)[number](*args)
-        try:
-            return self._replayed[number](*args)
-        except RuntimeError:
-            # A mesh builds the table that its light is sampled by at first use, which cannot be recorded: now, then.
-            dr.eval(self._scene.sample_emitter_direction(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Point2f(0.5), False))
-            return self._replayed[number](*args)
+            return function
+        replay = recorded(function, self._state)
+
+        def call(*args: Any) -> Any:
+            try:
+                return replay(*args)
+            except RuntimeError:
+                # Meshes, those of other scenes too, build the tables that their light is sampled by at first use, which
+                # cannot be recorded: now, then.
+                si = dr.zeros(mi.SurfaceInteraction3f, 1)
+                dr.eval(self._scene.sample_emitter_direction(si, mi.Point2f(0.5), False))
+                return replay(*args)
+
+        return call
 
     def _state(self, *_: Any) -> list[Any]:
         """All on the device that a frame's colours depend on, beside the arguments."""
