@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -15,9 +14,11 @@ from rsgen.device.arrays import Engine
 from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rstrack.compiled import compiled
 from rstrack.images.line_poses import Exposure
 from rstrack.images.pyramid import LEVELS, masked_pyramid
-from rstrack.images.sampling import EDGE, NEAREST
+from rstrack.images.sampling import NEAREST
+from rstrack.keyframes.surface import FloatImage, on_one_surface
 
 # Pixels of the smallest image of which every second one, in every second row, is enough, and of the largest one:
 # 320×240 and 640×480 lose nothing by that, while 160×120 has none to spare.
@@ -26,10 +27,6 @@ THINNED = LEVELS
 """Beside the pyramid's levels: the finest with every second of its pixels, for where a good many err alike."""
 # Of a keyframe on the device: five images, and of its points five of a quarter to a 64th of the pixels.
 _PIXEL_BYTES = 28
-# Normals come from a window of this many pixels; the residual itself is not smoothed.
-_NORMAL_WINDOW = 5
-
-FloatImage = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -112,60 +109,6 @@ def strides(width: int, height: int) -> tuple[int, ...]:
     return *(finest * 2**level for level in range(LEVELS)), 2 * finest
 
 
-def surface_slopes(rho: FloatImage, fx: float, fy: float) -> tuple[FloatImage, FloatImage]:
-    """Derivatives of inverse depth (h, w) by normalised coordinates, averaged over a window without crossing edges."""
-    out = []
-    for axis, focal in ((1, fx), (0, fy)):
-        r = rho if axis == 1 else rho.T
-        step = r[:, 1:] - r[:, :-1]
-        both = (r[:, 1:] > 0) & (r[:, :-1] > 0) & (np.abs(step) < EDGE * r[:, 1:])
-        total, count = np.zeros_like(r), np.zeros_like(r)
-        for side in (slice(None, -1), slice(1, None)):
-            total[:, side] += np.where(both, step, 0)
-            count[:, side] += both
-        if axis == 0:
-            total, count = total.T, count.T
-        window = (_NORMAL_WINDOW, _NORMAL_WINDOW)
-        mean_step, share = (np.asarray(cv2.boxFilter(np.ascontiguousarray(a), -1, window)) for a in (total, count))
-        out.append((focal * mean_step / np.maximum(share, np.float32(1e-3))).astype(np.float32))
-    return out[0], out[1]
-
-
-def surface_bends(slope_x: FloatImage, slope_y: FloatImage, fx: float, fy: float) -> tuple[FloatImage, FloatImage]:
-    """Size of the second differences (h, w) of inverse depth from pixel to pixel, along rows and columns."""
-    bend_x, bend_y = np.zeros_like(slope_x), np.zeros_like(slope_y)
-    bend_x[:, 1:-1] = np.abs(slope_x[:, 2:] - slope_x[:, :-2]) / np.float32(2.0 * fx)
-    bend_y[1:-1] = np.abs(slope_y[2:] - slope_y[:-2]) / np.float32(2.0 * fy)
-    return bend_x, bend_y
-
-
-def surface_roughness(rho: FloatImage, slope_x: FloatImage, slope_y: FloatImage, fx: float, fy: float) -> FloatImage:
-    """Error (h, w) in m that bilinear interpolation of inverse depth may have: an eighth of its second difference.
-
-    Where walls meet, the chord cuts the corner, always towards the camera: small, but it adds up from keyframe to
-    keyframe (0.02 mm each). Taken from the smoothed slopes, so that noise does not pass for corners; a corner's
-    second difference is spread over the window there.
-    """
-    bend_x, bend_y = surface_bends(slope_x, slope_y, fx, fy)
-    z = np.divide(np.float32(1.0), rho, out=np.zeros_like(rho), where=rho > 0)
-    return (_NORMAL_WINDOW / 8.0 * z * z * np.maximum(bend_x, bend_y)).astype(np.float32)
-
-
-def on_one_surface(rho: FloatImage) -> npt.NDArray[np.bool_]:
-    """Pixels (h, w) with depth whose neighbours right, left, above and below do not lie across an edge."""
-    valid = rho > 0
-    for axis in (0, 1):
-        a, b = (rho[1:], rho[:-1]) if axis == 0 else (rho[:, 1:], rho[:, :-1])
-        edge = np.abs(a - b) > EDGE * np.maximum(a, b)
-        if axis == 0:
-            valid[1:] &= ~edge
-            valid[:-1] &= ~edge
-        else:
-            valid[:, 1:] &= ~edge
-            valid[:, :-1] &= ~edge
-    return valid
-
-
 def pyramid_level(sampling: int) -> int:
     """Level of the pyramid that the pixels of a sampling, a level or `THINNED`, are taken from."""
     return 0 if sampling == THINNED else sampling
@@ -194,23 +137,42 @@ def level_points(
     if coarse is not None:
         images[1:] = _intensities(coarse, rho)[1:]
     out = []
+    focal = 1.0 / max(float(np.diff(rays[0, :, 0]).mean()), 1e-9)
     for sampling, stride in enumerate(strides(width, height)):
         level = pyramid_level(sampling)
         image, known = images[level]
-        pick = (slice(None, None, stride), slice(None, None, stride))
         # A level's pixels are 2^level apart.
-        on_level = (slice(None, None, stride // 2**level), slice(None, None, stride // 2**level))
-        at = image[on_level]
-        z = np.where(whole[pick] & known[on_level], 1.0 / np.maximum(rho[pick], 1e-6), 0.0)
-        gy, gx = np.gradient(image)
-        slope = (np.hypot(gx, gy)[on_level] / 2**level * rho[pick])[z > 0]
-        focal = 1.0 / max(float(np.diff(rays[0, :, 0]).mean()), 1e-9)
+        pick, on_level = _every(stride), _every(stride // 2**level)
+        at, inverse_z = image[on_level], rho[pick]
+        shown = whole[pick] & known[on_level]
+        z = np.where(shown, 1.0 / np.maximum(inverse_z, 1e-6), 0.0)
+        steepness = np.hypot(*gradient(image, stride // 2**level))
+        slope, depths = (steepness / 2**level * inverse_z)[shown], z[shown]
         bound = 2.0 * focal * float(np.percentile(slope, 99.5)) if slope.size else 1.0
-        median_depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+        median_depth = float(np.median(depths)) if depths.size else 1.0
         x, y = rays[..., 0][pick] * z, rays[..., 1][pick] * z
         on = e.upload(np.ones(z.shape))
         out.append(Points(e.upload(x), e.upload(y), e.upload(z), e.upload(at), on, median_depth, max(bound, 1e-2)))
     return tuple(out)
+
+
+def _every(stride: int) -> tuple[slice, slice]:
+    return slice(None, None, stride), slice(None, None, stride)
+
+
+@compiled
+def gradient(image: Any, stride: Any) -> Any:
+    """`np.gradient` of an image (h, w) by x and y, at every stride-th pixel of every stride-th row."""
+    height, width = image.shape
+    shape = (height - 1) // stride + 1, (width - 1) // stride + 1
+    by_x, by_y = np.empty(shape, image.dtype), np.empty(shape, image.dtype)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            y, x = i * stride, j * stride
+            left, right, above, below = max(x - 1, 0), min(x + 1, width - 1), max(y - 1, 0), min(y + 1, height - 1)
+            by_x[i, j] = (image[y, right] - image[y, left]) / np.float32(right - left)
+            by_y[i, j] = (image[below, x] - image[above, x]) / np.float32(below - above)
+    return by_x, by_y
 
 
 def _intensities(intensity: FloatImage, rho: FloatImage) -> list[tuple[FloatImage, npt.NDArray[np.bool_]]]:

@@ -19,17 +19,14 @@ from rstrack.images.line_poses import from_base, rows_of, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage, thumbnail
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import (
-    FloatImage,
-    Points,
     Reference,
     depth_scaling,
     level_points,
     rectified_lens,
     strides,
-    surface_roughness,
-    surface_slopes,
 )
 from rstrack.keyframes.rectification import ColorInput, FusionInput, color_kernel, fuse_kernel, rectify_kernel
+from rstrack.keyframes.surface import FloatImage, surface_roughness, surface_slopes
 
 # Metres at one metre: depths that differ by more show different surfaces.
 _AGREE = 0.03
@@ -76,17 +73,19 @@ class KeyframeMaker:
         with self.timer("keyframes: make"):
             T_world_base, base, rho = self.rectify(depth, spline)
             shape = base.camera.height, base.camera.width
-            host = e.download(rho, shape)
             if older is None or older.rolling is not None:
+                host = e.download(rho, shape)
                 return self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
-            # Its colours are looked up once its depth is known.
-            made = self._finish(index, depth, (), spline, t, T_world_base, base, rho, host, None)
+            # The older one is brought here while its slopes are worked out.
             T = se3.inverse(older.T_world_base) @ T_world_base
-            seen_from = e.upload(np.concatenate([rows_of(T), np.zeros(6)]))
-            rho, weight = self._fuse(made, older.lens, older.inverse_depth, older.weight, seen_from)
             _, grid = self._pinhole_rays(base)
             rectify = self._kernel(rectify_kernel, older.lens, base)
             old, *at = rectify(older.inverse_depth, *grid, e.upload(rows_of(se3.inverse(T))))
+            host = e.download(rho, shape)
+            slopes = (e.upload(slope) for slope in surface_slopes(host, base.camera.fx, base.camera.fy))
+            seen_from = e.upload(np.concatenate([rows_of(T), np.zeros(6)]))
+            own = rho, e.upload(host > 0), *slopes
+            rho, weight = self._fuse(own, base, older.lens, older.inverse_depth, older.weight, seen_from)
             host, old_host = e.download(rho, shape), e.download(old, shape)
             holes = (host <= 0) & (old_host > 0)
             host = np.where(holes, old_host, host)
@@ -138,15 +137,17 @@ class KeyframeMaker:
         """
         with self.timer("keyframes: fuse"):
             seen_from = from_base(self.e, spline, ref.T_world_base, depth.exposure)
-            rho, weight = self._fuse(ref, depth.exposure.lens, depth.inverse_z, self._ones(depth), seen_from, most)
+            own, lens = (ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y), depth.exposure.lens
+            rho, weight = self._fuse(own, ref.lens, lens, depth.inverse_z, self._ones(depth), seen_from, most)
         return replace(ref, inverse_depth=rho, weight=weight)
 
     def _fuse(
-        self, ref: Reference, lens: Lens, source: Any, source_weight: Any, seen_from: Any, most: float = _MOST
-    ) -> tuple[Any, Any]:
-        own = ref.inverse_depth, ref.weight, ref.slope_x, ref.slope_y
+        self, own: tuple[Any, ...], base: Lens, lens: Lens, source: Any, source_weight: Any, seen_from: Any,
+        most: float = _MOST,
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """own: inverse depth, weight and slopes of the keyframe, whose lens is `base`."""
         given = FusionInput(*own, source, source_weight, seen_from, self.e.upload(np.array([_AGREE, most])))
-        fused: tuple[Any, Any] = self._kernel(fuse_kernel, lens, ref.lens)(given)
+        fused: tuple[Any, Any] = self._kernel(fuse_kernel, lens, base)(given)
         return fused
 
     def _ones(self, depth: DepthImage) -> Any:
@@ -164,7 +165,7 @@ class KeyframeMaker:
 
     def revived(self, small: Reference, rho: FloatImage, weight: npt.NDArray[Any]) -> Reference:
         """A rectified keyframe from what `Reference.emptied` left of it, its inverse depth and its weight (h, w)."""
-        return self._with_surface(small, self.e.upload(rho), rho, weight)
+        return self._with_points(self._surface(small, self.e.upload(rho), rho, weight), rho)
 
     def _finish(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
@@ -174,48 +175,56 @@ class KeyframeMaker:
         """inherited (h, w): intensities of what rests, NaN where they are not known, for where something moves."""
         e = self.e
         rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
-        intensity, coarse, color_thumbnail, moments = None, None, None, np.zeros(2)
-        if colors:
-            color = min(colors, key=lambda c: abs(c.exposure.mid_time - t))
-            moments, color_thumbnail = color.moments, thumbnail_without(color, depth)
+        color = min(colors, key=lambda c: abs(c.exposure.mid_time - t)) if colors else None
+        looked_up = []
+        if color is not None:
             _, grid = (self.rays, self.device_rays) if rolling else self._pinhole_rays(lens)
             seen_at = to_base(e, spline, T_world_base, rolling)
             seen_from = from_base(e, spline, T_world_base, color.exposure)
-
-            def look_up(level: int) -> FloatImage:
+            for level in sorted({0, max(0, color.finer)}):
                 kernel = self._kernel(color_kernel, color.exposure.lens, lens, level)
-                value, seen = kernel(ColorInput(device_rho, *grid, seen_at, color.levels[level], seen_from))
-                known = e.download(seen, rho.shape) > 0
-                return np.where(known, e.download(value, rho.shape), np.nan).astype(np.float32)
-
-            intensity = look_up(0)
-            if color.finer > 0:
-                coarse = look_up(color.finer)
-            if depth.whole is not None:
-                hidden = self._hidden(depth, depth.whole, spline)
-                intensity[hidden] = np.nan if inherited is None else inherited[hidden]
-                if coarse is not None:
-                    coarse[hidden] = np.nan
+                looked_up.append(kernel(ColorInput(device_rho, *grid, seen_at, color.levels[level], seen_from)))
+        # While the device looks colours up.
+        shown = np.where(rho > 0, 1.0, 0.0) if weight is None else weight
         small = Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, None, None, None, None, None, (), 1.0, 1.0, 0,
-            moments, intensity, thumbnail(rho, rho > 0), color_thumbnail, coarse_intensity=coarse,
+            np.zeros(2), None, thumbnail(rho, rho > 0), None,
         )  # fmt: skip
-        return self._with_surface(small, device_rho, rho, np.where(rho > 0, 1.0, 0.0) if weight is None else weight)
+        made = self._surface(small, device_rho, rho, shown)
+        if color is None:
+            return made
+        known = ((e.download(value, rho.shape), e.download(seen, rho.shape) > 0) for value, seen in looked_up)
+        images = [np.where(seen, value, np.nan).astype(np.float32) for value, seen in known]
+        if depth.whole is not None:
+            hidden = self._hidden(depth, depth.whole, spline)
+            for image in images:
+                image[hidden] = np.nan
+            if inherited is not None:
+                images[0][hidden] = inherited[hidden]
+        made = replace(
+            made, moments=color.moments, color_thumbnail=thumbnail_without(color, depth), intensity=images[0],
+            coarse_intensity=images[1] if len(images) > 1 else None,
+        )  # fmt: skip
+        return self._with_points(made, rho)
 
-    def _with_surface(self, small: Reference, device_rho: Any, rho: FloatImage, weight: npt.NDArray[Any]) -> Reference:
+    def _surface(self, small: Reference, device_rho: Any, rho: FloatImage, weight: npt.NDArray[Any]) -> Reference:
+        """With its inverse depth and weight (h, w), and what these show of its surfaces."""
         e, camera = self.e, small.lens.camera
-        rays = self.rays if small.rolling else self._pinhole_rays(small.lens)[0]
         slope_x, slope_y = surface_slopes(rho, camera.fx, camera.fy)
         roughness = surface_roughness(rho, slope_x, slope_y, camera.fx, camera.fy)
-        points: tuple[Points, ...] = ()
-        if small.intensity is not None:
-            points = level_points(e, rho, rays, small.intensity, small.coarse_intensity)
         median_depth, bound = depth_scaling(rho)
         return replace(
             small, inverse_depth=device_rho, slope_x=e.upload(slope_x), slope_y=e.upload(slope_y),
-            roughness=e.upload(roughness), weight=e.upload(weight), points=points, median_depth=median_depth,
+            roughness=e.upload(roughness), weight=e.upload(weight), median_depth=median_depth,
             bound=bound, pixels=int(np.count_nonzero(rho)) // strides(camera.width, camera.height)[0] ** 2,
         )  # fmt: skip
+
+    def _with_points(self, made: Reference, rho: FloatImage) -> Reference:
+        """With its points, if it has colours."""
+        if made.intensity is None:
+            return made
+        rays = self.rays if made.rolling else self._pinhole_rays(made.lens)[0]
+        return replace(made, points=level_points(self.e, rho, rays, made.intensity, made.coarse_intensity))
 
 
 def _looked_up(image: FloatImage, x: FloatImage, y: FloatImage, known: npt.NDArray[np.bool_]) -> FloatImage:

@@ -28,8 +28,9 @@ from rstrack.data.estimate import TRAJECTORY, Estimate
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.images.device_frame import DeviceRig, frame_without
 from rstrack.images.pyramid import depth_image
-from rstrack.keyframes.keyframe import Reference, on_one_surface
+from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.keyframes.surface import on_one_surface
 from rstrack.mapping.color_fusion import SIGMA_PX, ColorFusion, FusedColor, linear_image
 from rstrack.options import Options
 

@@ -24,7 +24,8 @@ from rstrack.alignment.block_sums import block_counts
 from rstrack.calibration.parameters import DRIFT, EXTRINSICS, Parameters
 from rstrack.images.line_poses import rows_of
 from rstrack.images.sampling import EDGE
-from rstrack.keyframes.keyframe import depth_scaling, surface_bends, surface_slopes
+from rstrack.keyframes.keyframe import depth_scaling
+from rstrack.keyframes.surface import surface_bends, surface_slopes
 
 # Part of the width over which inverse depth is averaged, to either side.
 _WINDOW = 1.0 / 160.0

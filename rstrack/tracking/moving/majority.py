@@ -24,7 +24,7 @@ from rstrack.data.moving_masks import Mask
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import ColorImage
 from rstrack.images.sampling import EDGE
-from rstrack.keyframes.keyframe import FloatImage, on_one_surface, surface_slopes
+from rstrack.keyframes.surface import FloatImage, on_one_surface, surface_slopes
 
 # Pixels over which inverse depth is averaged.
 _AVERAGED = 5
