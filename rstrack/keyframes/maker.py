@@ -82,9 +82,9 @@ class KeyframeMaker:
             rectify = self._kernel(rectify_kernel, older.lens, base)
             old, *at = rectify(older.inverse_depth, *grid, e.upload(rows_of(se3.inverse(T))))
             host = e.download(rho, shape)
-            slopes = (e.upload(slope) for slope in surface_slopes(host, base.camera.fx, base.camera.fy))
+            slope_x, slope_y = surface_slopes(host, base.camera.fx, base.camera.fy)
             seen_from = e.upload(np.concatenate([rows_of(T), np.zeros(6)]))
-            own = rho, e.upload(host > 0), *slopes
+            own = rho, e.upload(host > 0), e.upload(slope_x), e.upload(slope_y)
             rho, weight = self._fuse(own, base, older.lens, older.inverse_depth, older.weight, seen_from)
             host, old_host = e.download(rho, shape), e.download(old, shape)
             holes = (host <= 0) & (old_host > 0)
@@ -142,7 +142,7 @@ class KeyframeMaker:
         return replace(ref, inverse_depth=rho, weight=weight)
 
     def _fuse(
-        self, own: tuple[Any, ...], base: Lens, lens: Lens, source: Any, source_weight: Any, seen_from: Any,
+        self, own: tuple[Any, Any, Any, Any], base: Lens, lens: Lens, source: Any, source_weight: Any, seen_from: Any,
         most: float = _MOST,
     ) -> tuple[Any, Any]:  # fmt: skip
         """own: inverse depth, weight and slopes of the keyframe, whose lens is `base`."""
