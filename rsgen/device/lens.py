@@ -6,21 +6,29 @@ Coordinates are device floats of any Dr.Jit backend.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
+from rsgen.array_types import FloatArray
+from rsgen.device.arrays import Engine, Inputs, recorded
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 
 # Newton steps for inverting the distortion: quadratic convergence reaches float32's end in fewer.
 _UNDISTORT_STEPS = 8
+# In place of a pinhole's, which has none.
+_LARGEST_RADIUS = 1e6
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What a kernel needs to know of a camera and its shutter; all of it is compiled in."""
+    """What a kernel needs to know of a camera and its shutter. All of it is compiled in but the numbers of a
+    `TracedCamera`."""
 
     camera: Camera
     shutter: Shutter
@@ -41,6 +49,67 @@ class Lens:
     def line_gradient(self) -> tuple[float, float]:
         """Derivative of `line_of` by the pixel."""
         return (0.0, self.shutter.direction) if self.shutter.by_rows else (self.shutter.direction, 0.0)
+
+
+class TracedCamera(Camera):
+    """A camera of device floats, as the functions of `rsgen.device` take it: another one needs no other kernel.
+
+    Its size, and the model of its distortion, are still compiled in.
+    """
+
+    inverse_fx: Any
+    inverse_fy: Any
+
+    def __init__(self, camera: Camera, numbers: Sequence[Any]) -> None:
+        """numbers: `camera_numbers`, on the device."""
+        fx, fy, cx, cy, max_radius, *distortion = numbers
+        self.__dict__.update(
+            width=camera.width, height=camera.height, model=camera.model, fx=fx, fy=fy, cx=cx, cy=cy,
+            max_radius=max_radius, distortion=tuple(distortion), inverse_fx=dr.rcp(fx), inverse_fy=dr.rcp(fy),
+        )  # fmt: skip
+
+    def wider(self, times: int) -> TracedCamera:
+        """The same for images so many times as wide and as high."""
+        found = copy(self)
+        found.__dict__.update(width=times * self.width, height=times * self.height)
+        return found
+
+
+def camera_numbers(camera: Camera) -> FloatArray:
+    """What a `TracedCamera` has instead of the camera's numbers (5 + coefficients,)."""
+    largest = min(camera.max_radius, _LARGEST_RADIUS)
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, largest, *camera.distortion])
+
+
+def recorded_with(
+    e: Engine, inputs: type[Inputs], *lenses: Lens
+) -> Callable[[Callable[..., Any]], Callable[[Inputs], Any]]:  # fmt: skip
+    """`recorded_from` for a function of a dataclass of arrays and of lenses, which it gets with a `TracedCamera`."""
+    names = [field.name for field in fields(inputs)]  # type: ignore[arg-type]
+    # One number an array: a kernel reads such an array as cheaply as a constant.
+    numbers = [[e.upload(number) for number in camera_numbers(lens.camera)] for lens in lenses]
+    flat = [number for own in numbers for number in own]
+
+    def decorate(function: Callable[..., Any]) -> Callable[[Inputs], Any]:
+        def of_arrays(*arrays: Any) -> Any:
+            rest, traced = list(arrays[len(names) :]), []
+            for lens, own in zip(lenses, numbers, strict=True):
+                traced.append(Lens(TracedCamera(lens.camera, rest[: len(own)]), lens.shutter))
+                del rest[: len(own)]
+            return function(inputs(*arrays[: len(names)]), *traced)
+
+        # What a recorded function refers to is looked through at every call: nothing but a function costs nothing.
+        frozen = recorded(lambda *arrays: of_arrays(*arrays))
+        return lambda given: frozen(*(getattr(given, name) for name in names), *flat)
+
+    return decorate
+
+
+def per_focal(camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
+    """x and y over the focal lengths."""
+    if isinstance(camera, TracedCamera):
+        return x * camera.inverse_fx, y * camera.inverse_fy
+    return x / camera.fx, y / camera.fy
 
 
 def contains(camera: Camera, x: Any, y: Any) -> Any:

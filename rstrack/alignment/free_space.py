@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
-from rsgen.device.arrays import Engine, Kernels, recorded_from
-from rsgen.device.lens import Lens
+from rsgen.device.arrays import Engine, Kernels
+from rsgen.device.lens import Lens, recorded_with
 from rsgen.device.projection import TO_BASE, gather, move, project_rolling
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import MID_GREY
@@ -89,10 +89,10 @@ def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays:
 
     has_rays: whether the image's rays are given; a rectified one's are those of its pinhole.
     """
-    there = other.camera
 
-    @recorded_from(SpaceInput)
-    def kernel(given: SpaceInput) -> Any:
+    @recorded_with(e, SpaceInput, lens, other)
+    def kernel(given: SpaceInput, lens: Lens, other: Lens) -> Any:
+        there = other.camera
         rho, seen, inside = _moved(e, lens, other, stride, has_rays, given)
         # The nearest of what is seen about there: an edge may lie a pixel or two elsewhere.
         nearest_rho = e.Float(0.0)
@@ -115,8 +115,8 @@ def meeting_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bo
     """
     columns = -(-other.camera.width // stride)
 
-    @recorded_from(MeetingInput)
-    def kernel(given: MeetingInput) -> Any:
+    @recorded_with(e, MeetingInput, lens, other)
+    def kernel(given: MeetingInput, lens: Lens, other: Lens) -> Any:
         _, seen, inside = _moved(e, lens, other, stride, has_rays, given)
         value, met = surface(e, other.camera, given.other, seen.x, seen.y, inside)
         apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, _UNKNOWN)
@@ -146,10 +146,11 @@ class IntensityInput:
 def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: int) -> Callable[[IntensityInput], Any]:
     """Kernel → the colour image's intensity less the one expected, of each of the keyframe's points."""
     width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
-    shrink, ref = 0.5**level, ref_lens.camera
+    shrink = 0.5**level
 
-    @recorded_from(IntensityInput)
-    def kernel(given: IntensityInput) -> Any:
+    @recorded_with(e, IntensityInput, lens, ref_lens)
+    def kernel(given: IntensityInput, lens: Lens, ref_lens: Lens) -> Any:
+        ref = ref_lens.camera
         _, x, y = grid(e, ref.width, ref.height, stride)
         p = moved_to_base(e, ref_lens, given.to_base, x, y, (given.x, given.y, given.z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)

@@ -22,8 +22,8 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine, recorded_from
-from rsgen.device.lens import Lens
+from rsgen.device.arrays import Engine
+from rsgen.device.lens import Lens, per_focal, recorded_with
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project_rolling
 from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
@@ -78,10 +78,11 @@ def geometric_kernel(
     lens, ref_lens: the current depth camera's and the reference's, whose frame is the base if it is rectified. shifts:
     with the columns of `whole_image`.
     """
-    camera, ref, count = lens.camera, ref_lens.camera, WHOLE if shifts else 0
+    count = WHOLE if shifts else 0
 
-    @recorded_from(GeometricInput)
-    def kernel(given: GeometricInput) -> Any:
+    @recorded_with(e, GeometricInput, lens, ref_lens)
+    def kernel(given: GeometricInput, lens: Lens, ref_lens: Lens) -> Any:
+        camera, ref = lens.camera, ref_lens.camera
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
@@ -148,7 +149,7 @@ def plane_distance(
     inv_m = share * even * dr.rsqrt(mx * mx + my * my + mz * mz)
     r = (1.0 - seen.z * value) * inv_m
     scale = -seen.z * inv_m
-    return r, seen.chain(scale * mx / ref.fx, scale * my / ref.fy, -value * inv_m), rough <= limit
+    return r, seen.chain(*per_focal(ref, scale * mx, scale * my), -value * inv_m), rough <= limit
 
 
 def evened(z: Any, inv_median_depth: Any) -> Any:
@@ -188,12 +189,12 @@ def photometric_kernel(
     blurred points count less; 0: all alike.
     """
     weighs_blur = blur_sigma_px > 0.0 and lens.lines > 1 and lens.shutter.exposure_s > 0.0
-    camera, ref = lens.camera, ref_lens.camera
-    width, height = level_size(camera.width, level), level_size(camera.height, level)
     shrink = 0.5**level
 
-    @recorded_from(PhotometricInput)
-    def kernel(given: PhotometricInput) -> Any:
+    @recorded_with(e, PhotometricInput, lens, ref_lens)
+    def kernel(given: PhotometricInput, lens: Lens, ref_lens: Lens) -> Any:
+        camera, ref = lens.camera, ref_lens.camera
+        width, height = level_size(camera.width, level), level_size(camera.height, level)
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
         gain, offset = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
 
@@ -246,10 +247,10 @@ def visibility_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Cal
     The depth image need not be taken at the colour image's time: what hides a point hides it a few milliseconds later.
     Unknown counts as visible.
     """
-    camera, ref = lens.camera, ref_lens.camera
 
-    @recorded_from(VisibilityInput)
-    def kernel(given: VisibilityInput) -> Any:
+    @recorded_with(e, VisibilityInput, lens, ref_lens)
+    def kernel(given: VisibilityInput, lens: Lens, ref_lens: Lens) -> Any:
+        camera, ref = lens.camera, ref_lens.camera
         _, x, y = grid(e, ref.width, ref.height, stride)
         p = moved_to_base(e, ref_lens, given.to_base, x, y, (given.x, given.y, given.z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)

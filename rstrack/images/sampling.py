@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 
 from rsgen.device.arrays import Engine
-from rsgen.device.lens import Lens
+from rsgen.device.lens import Lens, per_focal
 from rsgen.device.projection import TO_BASE, Vector, gather, move
 from rsgen.geometry.camera import Camera
 
@@ -30,7 +30,7 @@ def grid(e: Engine, width: int, height: int, stride: int) -> tuple[Any, Any, Any
 
 def pinhole_ray(e: Engine, camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
     """Normalised coordinates of pixels, whose numbers are integers, of a pinhole image."""
-    return (e.Float(x) - camera.cx) / camera.fx, (e.Float(y) - camera.cy) / camera.fy
+    return per_focal(camera, e.Float(x) - camera.cx, e.Float(y) - camera.cy)
 
 
 def depth_of(rho: Any) -> tuple[Any, Any]:

@@ -25,7 +25,14 @@ from rstrack.keyframes.keyframe import (
     rectified_lens,
     strides,
 )
-from rstrack.keyframes.rectification import ColorInput, FusionInput, color_kernel, fuse_kernel, rectify_kernel
+from rstrack.keyframes.rectification import (
+    ColorInput,
+    FusionInput,
+    RectifyInput,
+    color_kernel,
+    fuse_kernel,
+    rectify_kernel,
+)
 from rstrack.keyframes.surface import FloatImage, surface_roughness, surface_slopes
 
 # Metres at one metre: depths that differ by more show different surfaces.
@@ -80,7 +87,7 @@ class KeyframeMaker:
             T = se3.inverse(older.T_world_base) @ T_world_base
             _, grid = self._pinhole_rays(base)
             rectify = self._kernel(rectify_kernel, older.lens, base)
-            old, *at = rectify(older.inverse_depth, *grid, e.upload(rows_of(se3.inverse(T))))
+            old, *at = rectify(RectifyInput(older.inverse_depth, *grid, e.upload(rows_of(se3.inverse(T)))))
             host = e.download(rho, shape)
             slope_x, slope_y = surface_slopes(host, base.camera.fx, base.camera.fy)
             seen_from = e.upload(np.concatenate([rows_of(T), np.zeros(6)]))
@@ -106,7 +113,8 @@ class KeyframeMaker:
         base = rectified_lens(lens.camera)
         T_world_base: FloatArray = spline.pose(depth.exposure.mid_time)
         seen_at = to_base(self.e, spline, T_world_base, depth.exposure)
-        rho, _, _ = self._kernel(rectify_kernel, lens, base)(depth.inverse_z, *self.device_rays, seen_at)
+        rectify = self._kernel(rectify_kernel, lens, base)
+        rho, _, _ = rectify(RectifyInput(depth.inverse_z, *self.device_rays, seen_at))
         return T_world_base, base, rho
 
     def _hidden(self, depth: DepthImage, whole: DepthImage, spline: Spline) -> npt.NDArray[np.bool_]:

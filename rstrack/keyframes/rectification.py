@@ -12,8 +12,8 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine, recorded, recorded_from
-from rsgen.device.lens import Lens
+from rsgen.device.arrays import Engine
+from rsgen.device.lens import Lens, per_focal, recorded_with
 from rsgen.device.projection import TO_BASE, gather, move, project, project_rolling
 from rstrack.images.sampling import (
     bilinear_value,
@@ -35,7 +35,7 @@ _SETTLED = 0.02
 def _ray(e: Engine, lens: Lens, rays: tuple[Any, Any], x: Any, y: Any, active: Any) -> tuple[Any, Any]:
     camera = lens.camera
     if camera.model == "pinhole":
-        return (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+        return per_focal(camera, x - camera.cx, y - camera.cy)
     xn, yn = (bilinear_value(e, table, camera.width, camera.height, x, y, active)[0] for table in rays)
     return xn, yn
 
@@ -55,20 +55,30 @@ def _first_guess(e: Engine, lens: Lens, base: Lens, x: Any, y: Any) -> tuple[Any
     """Where a source that stood still would show the keyframe's pixel (x, y)."""
     if lens.camera.model == "pinhole":
         return e.Float(x), e.Float(y)
-    ray = (x - base.camera.cx) / base.camera.fx, (y - base.camera.cy) / base.camera.fy, e.Float(1.0)
+    ray = *per_focal(base.camera, x - base.camera.cx, y - base.camera.cy), e.Float(1.0)
     at = project(lens.camera, ray)
     return dr.select(at.valid, at.x, x), dr.select(at.valid, at.y, y)
 
 
-def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
-    """Kernel (inverse_depth, rays_x, rays_y, to_base) → (inverse depth in the base image, source x, source y).
+@dataclass(frozen=True)
+class RectifyInput:
+    """Device arrays: the source's inverse depth and rays, and the poses of its lines."""
+
+    inverse_depth: Any
+    rays_x: Any
+    rays_y: Any
+    to_base: Any
+
+
+def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[RectifyInput], Any]:
+    """Kernel → (inverse depth in the base image, source x, source y).
 
     0 where the source shows nothing. `base` is a global-shutter pinhole.
     """
-    camera = base.camera
 
-    @recorded
-    def kernel(rho: Any, rays_x: Any, rays_y: Any, to_base: Any) -> Any:
+    @recorded_with(e, RectifyInput, lens, base)
+    def kernel(given: RectifyInput, lens: Lens, base: Lens) -> Any:
+        camera = base.camera
         _, px, py = grid(e, camera.width, camera.height, 1)
         goal_x, goal_y = e.Float(px), e.Float(py)
         x, y = _first_guess(e, lens, base, goal_x, goal_y)
@@ -76,11 +86,11 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
         value, active, miss = e.Float(0.0), e.Bool(True), e.Float(0.0)
         for _ in range(ITERATIONS):
             x, y = dr.clip(x, 0.0, width - 1.001), dr.clip(y, 0.0, height - 1.001)
-            value, active = surface(e, lens.camera, rho, x, y, e.Bool(True))
+            value, active = surface(e, lens.camera, given.inverse_depth, x, y, e.Bool(True))
             # Where there is no depth the last guess is as good as any; it may move back onto the surface.
             z = dr.rcp(dr.select(active, value, 1.0))
-            rx, ry = _ray(e, lens, (rays_x, rays_y), x, y, e.Bool(True))
-            at = project(camera, move(_pose(e, lens, to_base, x, y), (rx * z, ry * z, z)))
+            rx, ry = _ray(e, lens, (given.rays_x, given.rays_y), x, y, e.Bool(True))
+            at = project(camera, move(_pose(e, lens, given.to_base, x, y), (rx * z, ry * z, z)))
             dx, dy = goal_x - at.x, goal_y - at.y
             miss = dr.maximum(dr.abs(dx), dr.abs(dy))
             value = dr.rcp(at.q[2])
@@ -88,7 +98,7 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
             ok = at.valid & dr.isfinite(dx + dy)
             if lens.camera.model != "pinhole":
                 # A fisheye's pixels are up to twice as wide as the keyframe's: the step would overshoot and swing.
-                dx, dy = project(lens.camera, (rx, ry, e.Float(1.0))).jvp((dx / camera.fx, dy / camera.fy, 0.0))
+                dx, dy = project(lens.camera, (rx, ry, e.Float(1.0))).jvp((*per_focal(camera, dx, dy), 0.0))
             x, y = dr.select(ok, x + dr.clip(dx, -40.0, 40.0), x), dr.select(ok, y + dr.clip(dy, -40.0, 40.0), y)
         return dr.select(active, value, 0.0), x, y
 
@@ -114,8 +124,8 @@ def color_kernel(e: Engine, lens: Lens, base: Lens, level: int = 0) -> Callable[
     width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
     shrink = 0.5**level
 
-    @recorded_from(ColorInput)
-    def kernel(given: ColorInput) -> Any:
+    @recorded_with(e, ColorInput, lens, base)
+    def kernel(given: ColorInput, lens: Lens, base: Lens) -> Any:
         z, active = depth_of(given.inverse_depth)
         _, x, y = grid(e, base.camera.width, base.camera.height, 1)
         p = moved_to_base(e, base, given.to_base, x, y, (given.rays_x * z, given.rays_y * z, z))
@@ -150,8 +160,8 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[FusionInput], An
     measurements of unit quality, 1/σ_z² over that of a pixel at one metre.
     """
 
-    @recorded_from(FusionInput)
-    def kernel(given: FusionInput) -> Any:
+    @recorded_with(e, FusionInput, lens, base)
+    def kernel(given: FusionInput, lens: Lens, base: Lens) -> Any:
         rho, weight = given.inverse_depth, given.weight
         gate, limit = dr.gather(e.Float, given.constants, e.UInt(0)), dr.gather(e.Float, given.constants, e.UInt(1))
         _, px, py = grid(e, base.camera.width, base.camera.height, 1)

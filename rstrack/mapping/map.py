@@ -30,7 +30,7 @@ from rstrack.images.line_poses import IDENTITY_TO_BASE, Exposure, from_base_tabl
 from rstrack.images.pyramid import depth_image
 from rstrack.images.sampling import bilinear_value, pinhole_points
 from rstrack.keyframes.keyframe import rectified_lens
-from rstrack.keyframes.rectification import rectify_kernel
+from rstrack.keyframes.rectification import RectifyInput, rectify_kernel
 from rstrack.metrics.association import compare, truth_of
 from rstrack.options import MapOptions, Options
 from rstrack.volume.mesh import TriangleSurface, extract_surface, write_ply
@@ -94,7 +94,7 @@ class FrameMapper:
         else:
             seen_at = IDENTITY_TO_BASE
         rectify = self._kernel(rectify_kernel, device.depth_lens, self.base)
-        rho, _, _ = rectify(depth.inverse_z, *device.device_rays, e.upload(seen_at))
+        rho, _, _ = rectify(RectifyInput(depth.inverse_z, *device.device_rays, e.upload(seen_at)))
         self._volume.integrate(
             rho, self._T_world_estimate @ T_estimate_base, self.base, color=self._colors(frame, rho, T_estimate_base, t)
         )

@@ -17,13 +17,13 @@ from typing import Any
 import drjit as dr
 
 from rsgen.device.arrays import Engine, recorded_from
-from rsgen.device.lens import Lens
+from rsgen.device.lens import Lens, TracedCamera
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
 from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.images import ACROSS
-from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, wider, without_error
+from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
 from rstrack.images.sampling import cubic_value_and_slope, level_size, surface
 
 
@@ -169,7 +169,8 @@ def depth_residual(
     seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, first)
     active = at.active & seen.valid & _inside(width, height, 0.0, seen.x, seen.y)
     x, y = in_atlas(pixels.reference, width, height, seen.x, seen.y)
-    atlas = wider(lens.camera, ACROSS)
+    assert isinstance(lens.camera, TracedCamera)
+    atlas = lens.camera.wider(ACROSS)
     rho, active = surface(e, atlas, given.inverse_depth, x, y, active)
     if asked.corrects:
         rho = dr.rcp(without_error(e, asked, dr.rcp(rho), seen.at.xn, seen.at.yn, given.error))

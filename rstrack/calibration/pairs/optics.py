@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import Engine
-from rsgen.device.lens import Lens
+from rsgen.device.lens import Lens, TracedCamera, camera_numbers
 from rsgen.device.projection import Projection, Vector
 from rsgen.geometry.camera import Camera
 from rstrack.calibration.parameters import DEPTH, LENS, NAMES
@@ -62,33 +61,16 @@ class Optics:
 
 def camera_table(camera: Camera) -> FloatArray:
     """What `traced` takes (13,)."""
-    bent = (*camera.distortion, *(0.0,) * _BENDS)[:_BENDS]
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *bent, min(camera.max_radius, 1e6)])
+    table = np.zeros(5 + _BENDS)
+    numbers = camera_numbers(camera)
+    table[: len(numbers)] = numbers
+    return table
 
 
 def traced(e: Engine, lens: Lens, table: Any) -> Lens:
     """The lens with a camera whose focal lengths, principal point and distortion a kernel reads from `camera_table`."""
-    values = [dr.gather(e.Float, table, e.UInt(i)) for i in range(5 + _BENDS)]
-    camera = lens.camera
-    return Lens(_Traced(camera, values), lens.shutter)
-
-
-class _Traced(Camera):
-    """A camera of device floats, as the functions of `rsgen.device` take it."""
-
-    def __init__(self, camera: Camera, values: Sequence[Any]) -> None:
-        names = "fx", "fy", "cx", "cy"
-        self.__dict__.update(
-            width=camera.width, height=camera.height, model=camera.model, max_radius=values[-1],
-            distortion=tuple(values[4 : 4 + len(camera.distortion)]), **dict(zip(names, values[:4], strict=True)),
-        )  # fmt: skip
-
-
-def wider(camera: Camera, times: int) -> Camera:
-    """The traced camera as one of images so many times as wide and as high."""
-    found = copy(camera)
-    found.__dict__.update(width=times * camera.width, height=times * camera.height)
-    return found
+    values = [dr.gather(e.Float, table, e.UInt(i)) for i in range(5 + len(lens.camera.distortion))]
+    return Lens(TracedCamera(lens.camera, values), lens.shutter)
 
 
 def without_error(e: Engine, asked: Asked, z: Any, xn: Any, yn: Any, table: Any) -> Any:

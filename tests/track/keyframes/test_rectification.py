@@ -36,7 +36,7 @@ from rstrack.keyframes.keyframe import (
     rectified_lens,
     strides,
 )
-from rstrack.keyframes.rectification import ColorInput, color_kernel, rectify_kernel
+from rstrack.keyframes.rectification import ColorInput, RectifyInput, color_kernel, rectify_kernel
 
 WIDTH, HEIGHT = 160, 120
 STAMP = 0.42
@@ -112,7 +112,7 @@ def test_rectification_knows_where_each_pixel_comes_from() -> None:
     depth = depth_input(cast_box, truth, image)
     kernel = rectify_kernel(ENGINE, image.lens, base)
     to_base = ENGINE.upload(to_base_table(truth, T_world_base, image))
-    rho, x, y = (download(a) for a in kernel(depth.inverse_z, *maker(camera).device_rays, to_base))
+    rho, x, y = (download(a) for a in kernel(RectifyInput(depth.inverse_z, *maker(camera).device_rays, to_base)))
     found = rho > 0
     p = se3.transform(T_world_base, base.camera.backproject(base.camera.pixel_grid(), 1.0 / np.where(found, rho, 1.0)))
     uv, _, valid = project_rolling(truth, np.eye(4), camera, image.lens.shutter, STAMP, p[found])
