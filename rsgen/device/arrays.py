@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import gc
 import importlib
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, wraps
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -113,6 +113,67 @@ def recorded_from(inputs: type[Inputs]) -> Callable[[Callable[[Inputs], Any]], C
         return lambda given: frozen(*(getattr(given, name) for name in names))
 
     return decorate
+
+
+class Numbers:
+    """A dataclass whose numbers kernels are handed, and read as cheaply as constants: others need no other kernel.
+
+    COMPILED: names of fields that are no such numbers.
+    """
+
+    COMPILED: ClassVar[tuple[str, ...]] = ()
+
+    def _names(self) -> list[str]:
+        return [field.name for field in fields(self) if field.name not in self.COMPILED]  # type: ignore[arg-type]
+
+    @property
+    def numbers(self) -> list[float]:
+        """Whole ones are handed over as such."""
+        return [getattr(self, name) for name in self._names()]
+
+    def traced(self, numbers: Sequence[Any]) -> Self:
+        """The same with the device's `numbers`, for the function that becomes the kernel."""
+        return replace(self, **dict(zip(self._names(), numbers, strict=True)))  # type: ignore[type-var]
+
+
+def recorded_with(
+    e: Engine, inputs: type[Inputs], *what: Numbers
+) -> Callable[[Callable[..., Any]], Callable[[Inputs], Any]]:  # fmt: skip
+    """`recorded_from` for a function of a dataclass of arrays and of `what`, which has the device's numbers then."""
+    names = [field.name for field in fields(inputs)]  # type: ignore[arg-type]
+    counts = [len(one.numbers) for one in what]
+    numbers = [_handed(e, number) for one in what for number in one.numbers]
+
+    def decorate(function: Callable[..., Any]) -> Callable[[Inputs], Any]:
+        def of_arrays(*arrays: Any) -> Any:
+            given, rest = inputs(*arrays[: len(names)]), list(arrays[len(names) :])
+            traced = []
+            for one, count in zip(what, counts, strict=True):
+                traced.append(one.traced(rest[:count]))
+                del rest[:count]
+            return function(given, *traced)
+
+        # What a recorded function refers to is looked through at every call: nothing but a function costs nothing.
+        frozen = recorded(lambda *arrays: of_arrays(*arrays))
+        return lambda given: frozen(*(getattr(given, name) for name in names), *numbers)
+
+    return decorate
+
+
+def _handed(e: Engine, number: float) -> Any:
+    return e.UInt(aligned([number], np.uint32)) if isinstance(number, int) else e.upload(number)
+
+
+def quotient(number: Any, by: Any, share: Any) -> Any:
+    """number // by of whole numbers below four million, exactly; share: one over `by`, for where that is the device's.
+
+    Dividing by what is not a constant takes the device ten times as long.
+    """
+    import drjit as dr
+
+    if isinstance(by, int):
+        return number // by
+    return type(number)((dr.float32_array_t(number)(number) + 0.5) * share)
 
 
 def recorded(function: Callable[..., Any], state: Callable[..., Any] | None = None) -> Callable[..., Any]:

@@ -6,16 +6,14 @@ Coordinates are device floats of any Dr.Jit backend.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
-from rsgen.array_types import FloatArray
-from rsgen.device.arrays import Engine, Inputs, recorded
+from rsgen.device.arrays import Numbers
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 
@@ -26,21 +24,38 @@ _LARGEST_RADIUS = 1e6
 
 
 @dataclass(frozen=True)
-class Lens:
-    """What a kernel needs to know of a camera and its shutter. All of it is compiled in but the numbers of a
-    `TracedCamera`."""
+class Lens(Numbers):
+    """What a kernel needs to know of a camera and its shutter.
+
+    All of it is compiled in; where a kernel is handed the camera's numbers, only the distortion's model and the scan.
+    """
 
     camera: Camera
     shutter: Shutter
 
     @property
+    def numbers(self) -> list[float]:
+        """Of the camera; the shutter's are in tables of poses."""
+        return [self.camera.width, self.camera.height, *camera_numbers(self.camera)]
+
+    def traced(self, numbers: Sequence[Any]) -> Lens:
+        """With a `TracedCamera`."""
+        width, height, *others = numbers
+        return Lens(TracedCamera(self.camera, others, (width, height)), self.shutter)
+
+    @property
+    def rolls(self) -> bool:
+        """Whether its lines are exposed one after the other."""
+        return self.shutter.readout_s > 0.0
+
+    @property
     def lines(self) -> int:
         """Lines of an image; 1 stands for all of them with a global shutter."""
-        return self.shutter.line_count(self.camera) if self.shutter.readout_s > 0.0 else 1
+        return self.shutter.line_count(self.camera) if self.rolls else 1
 
     def line_of(self, x: Any, y: Any) -> Any:
         """Line coordinate of a pixel, 0 first read."""
-        if self.lines == 1:
+        if not self.rolls:
             return dr.zeros(type(x), 1)
         along = y if self.shutter.by_rows else x
         return along if self.shutter.direction > 0.0 else self.lines - 1 - along
@@ -52,20 +67,18 @@ class Lens:
 
 
 class TracedCamera(Camera):
-    """A camera of device floats, as the functions of `rsgen.device` take it: another one needs no other kernel.
-
-    Its size, and the model of its distortion, are still compiled in.
-    """
+    """A camera of device numbers, as the functions of `rsgen.device` take it: its model alone is compiled in."""
 
     inverse_fx: Any
     inverse_fy: Any
 
-    def __init__(self, camera: Camera, numbers: Sequence[Any]) -> None:
-        """numbers: `camera_numbers`, on the device."""
+    def __init__(self, camera: Camera, numbers: Sequence[Any], size: tuple[Any, Any] | None = None) -> None:
+        """numbers: `camera_numbers`, on the device. size: width and height, where they are not compiled in."""
         fx, fy, cx, cy, max_radius, *distortion = numbers
+        width, height = size or (camera.width, camera.height)
         self.__dict__.update(
-            width=camera.width, height=camera.height, model=camera.model, fx=fx, fy=fy, cx=cx, cy=cy,
-            max_radius=max_radius, distortion=tuple(distortion), inverse_fx=dr.rcp(fx), inverse_fy=dr.rcp(fy),
+            width=width, height=height, model=camera.model, fx=fx, fy=fy, cx=cx, cy=cy, max_radius=max_radius,
+            distortion=tuple(distortion), inverse_fx=dr.rcp(fx), inverse_fy=dr.rcp(fy),
         )  # fmt: skip
 
     def wider(self, times: int) -> TracedCamera:
@@ -75,34 +88,10 @@ class TracedCamera(Camera):
         return found
 
 
-def camera_numbers(camera: Camera) -> FloatArray:
-    """What a `TracedCamera` has instead of the camera's numbers (5 + coefficients,)."""
+def camera_numbers(camera: Camera) -> list[float]:
+    """What a `TracedCamera` has instead of the camera's: 5, and its coefficients."""
     largest = min(camera.max_radius, _LARGEST_RADIUS)
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, largest, *camera.distortion])
-
-
-def recorded_with(
-    e: Engine, inputs: type[Inputs], *lenses: Lens
-) -> Callable[[Callable[..., Any]], Callable[[Inputs], Any]]:  # fmt: skip
-    """`recorded_from` for a function of a dataclass of arrays and of lenses, which it gets with a `TracedCamera`."""
-    names = [field.name for field in fields(inputs)]  # type: ignore[arg-type]
-    # One number an array: a kernel reads such an array as cheaply as a constant.
-    numbers = [[e.upload(number) for number in camera_numbers(lens.camera)] for lens in lenses]
-    flat = [number for own in numbers for number in own]
-
-    def decorate(function: Callable[..., Any]) -> Callable[[Inputs], Any]:
-        def of_arrays(*arrays: Any) -> Any:
-            rest, traced = list(arrays[len(names) :]), []
-            for lens, own in zip(lenses, numbers, strict=True):
-                traced.append(Lens(TracedCamera(lens.camera, rest[: len(own)]), lens.shutter))
-                del rest[: len(own)]
-            return function(inputs(*arrays[: len(names)]), *traced)
-
-        # What a recorded function refers to is looked through at every call: nothing but a function costs nothing.
-        frozen = recorded(lambda *arrays: of_arrays(*arrays))
-        return lambda given: frozen(*(getattr(given, name) for name in names), *flat)
-
-    return decorate
+    return [camera.fx, camera.fy, camera.cx, camera.cy, largest, *camera.distortion]
 
 
 def per_focal(camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:

@@ -140,7 +140,7 @@ class RollingProjection:
         by the pixel and az by the depth q_z; the line's own change of time is included (docs/method.md)."""
         bx, by, bz = self.at.vjp(ax, ay)
         bz = bz + az
-        if self.lens.lines > 1:
+        if self.lens.rolls:
             rate = (ax * self.pixel_speed[0] + ay * self.pixel_speed[1] + az * self.speed[2]) * self.gain
             lx, ly, lz = self.at.vjp(*self.lens.line_gradient)
             bx, by, bz = bx + rate * lx, by + rate * ly, bz + rate * lz
@@ -161,7 +161,7 @@ def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any,
     three lines off at 0.5 m/s and 1 rad/s: what is left is below 3e-4 px, most of it rounding.
     """
     Float = type(p_base[0])
-    if lens.lines == 1:
+    if not lens.rolls:
         M = gather(table, UInt(0), 12)
         at = project(lens.camera, move(M, p_base))
         zero = Float(0.0)
@@ -169,11 +169,12 @@ def project_rolling(lens: Lens, table: Any, p_base: Vector, UInt: Any, Int: Any,
             at, at.x, at.y, at.q[2], zero, UInt(0), M, (zero, zero, zero), (zero, zero), Float(1.0), at.valid, lens
         )
     last = lens.lines - 1
-    middle = float(last // 2)
-    at, _, speed, pixel_speed, slope = _look(lens, table, UInt(last // 2) + first, p_base)
+    half = last // 2
+    middle = Float(half)
+    at, _, speed, pixel_speed, slope = _look(lens, table, UInt(half) + first, p_base)
     line = middle + (lens.line_of(at.x, at.y) - middle) / (1.0 - slope)
     valid = at.valid
-    row = UInt(Int(dr.round(dr.clip(dr.select(dr.isfinite(line), line, middle), 0.0, float(last)))))
+    row = UInt(Int(dr.round(dr.clip(dr.select(dr.isfinite(line), line, middle), 0.0, Float(last)))))
     at, M, speed, pixel_speed, slope = _look(lens, table, row + first, p_base)
     gain = dr.rcp(1.0 - slope)
     ahead = (lens.line_of(at.x, at.y) - Float(row)) * gain

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.device.arrays import Engine
+from rsgen.device.arrays import Engine, Numbers, quotient
 from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, cross
 from rstrack.alignment.weights import cost, curvature, weight
@@ -31,6 +31,8 @@ PAIR_BLOCKS = 15
 # of the coupling, n (n + 1) / 2 of their own H and n of their g more; and padding.
 _SLOTS, _PAD = 31, 16
 _UPPER = np.triu_indices(6)
+# What numbers of blocks are rounded up to, see `room`.
+_SPARE_BLOCKS = 64
 # Lanes that keep all cores of a CPU busy, and longest run: a longer one gains nothing.
 _LANES, _LONGEST = 1024, 40
 # No block: nothing has been added yet.
@@ -98,10 +100,9 @@ class Scaling:
         return np.array([1 / sigma, gate, 1 / self.median_depth, self.bound, *self.units, *more])
 
     def unpack(self, raw: IntArray, current: int, reference: int, columns: int = 0) -> BlockSums:
-        """Integers as summed on the device, with so many further columns, to `BlockSums`."""
-        H, g, totals, own, coupling = _unpacked(
-            raw.reshape(current, reference, -1), self.median_depth, self.bound, self.units, columns
-        )
+        """Integers as summed on the device, with so many further columns, to `BlockSums`; what follows is spare."""
+        used = raw.ravel()[: current * reference * _slots(columns)].reshape(current, reference, -1)
+        H, g, totals, own, coupling = _unpacked(used, self.median_depth, self.bound, self.units, columns)
         weighted, cost, count, compared = totals.tolist()
         unit_H, unit_g, unit_cost = self.units
         more = None
@@ -153,25 +154,56 @@ def block_counts(lens: Lens, ref_lens: Lens) -> tuple[int, int, int, int]:
     Sums of an image whose lines are exposed at once are separate too: their scatter shows how far its pixels are
     independent (`BlockSums.summed` is what they come to).
     """
-    blocks = BLOCKS if ref_lens.lines == 1 else PAIR_BLOCKS
+    blocks = PAIR_BLOCKS if ref_lens.rolls else BLOCKS
     lines = lens.camera.height if _is_global(lens, ref_lens) else lens.lines
     per, ref_per = max(1, lines // blocks), max(1, ref_lens.lines // blocks)
     return -(-lines // per), -(-ref_lens.lines // ref_per), per, ref_per
 
 
 def _is_global(lens: Lens, ref_lens: Lens) -> bool:
-    return lens.lines == 1 and ref_lens.lines == 1
+    return not lens.rolls and not ref_lens.rolls
 
 
-def block_slot(line: Any, ref_line: Any, lens: Lens, ref_lens: Lens, y: Any, columns: int = 0) -> Any:
+@dataclass(frozen=True)
+class Blocks(Numbers):
+    """Blocks of an image's lines and of a reference's.
+
+    reference: how many the latter has. per, ref_per: lines of a block; share, ref_share: one over them. last_row: of
+    the image.
+
+    rows: whether a pixel's own row counts, since all lines are exposed at once; pairs: whether the reference has more
+    than one block.
+    """
+
+    COMPILED: ClassVar[tuple[str, ...]] = ("rows", "pairs")
+
+    reference: int
+    per: int
+    share: float
+    ref_per: int
+    ref_share: float
+    last_row: int
+    rows: bool
+    pairs: bool
+
+    @classmethod
+    def of(cls, lens: Lens, ref_lens: Lens) -> Blocks:
+        """Of images of these lenses."""
+        _, reference, per, ref_per = block_counts(lens, ref_lens)
+        rows, last_row = _is_global(lens, ref_lens), lens.camera.height - 1
+        return cls(reference, per, 1.0 / per, ref_per, 1.0 / ref_per, last_row, rows, reference > 1)
+
+
+def block_slot(line: Any, ref_line: Any, blocks: Blocks, y: Any, columns: int = 0) -> Any:
     """First integer of each pixel's block, or pair of blocks.
 
     columns: further ones, see `ColumnSums`. y: the pixel's own, which is its line where all are exposed at once.
     """
-    _, reference, per, ref_per = block_counts(lens, ref_lens)
-    if _is_global(lens, ref_lens):
-        line = type(line)(dr.clip(y, 0, lens.camera.height - 1))
-    block = line // per if reference == 1 else line // per * reference + ref_line // ref_per
+    if blocks.rows:
+        line = type(line)(dr.clip(y, 0, blocks.last_row))
+    block = quotient(line, blocks.per, blocks.share)
+    if blocks.pairs:
+        block = block * blocks.reference + quotient(ref_line, blocks.ref_per, blocks.ref_share)
     return block * _slots(columns)
 
 
@@ -179,6 +211,13 @@ def sizes(lens: Lens, ref_lens: Lens, columns: int = 0) -> tuple[int, int]:
     """How many integers the sums of an image against a reference have in all, and how many each pixel adds to."""
     current, reference, _, _ = block_counts(lens, ref_lens)
     return current * reference * _slots(columns), _values(columns)
+
+
+def room(lens: Lens, ref_lens: Lens, columns: int = 0) -> tuple[int, int]:
+    """`sizes` with a few blocks to spare: their number is compiled in, and most images have about as many."""
+    size, values = sizes(lens, ref_lens, columns)
+    spare = _SPARE_BLOCKS * _slots(columns)
+    return -(-size // spare) * spare, values
 
 
 def _values(columns: int) -> int:
@@ -256,21 +295,44 @@ def every(e: Engine, width: int, height: int, stride: int) -> PixelGrid:
     return _pixels(width, columns, stride, number - number // columns * columns, number // columns, e.Bool(True))
 
 
-def summed(
-    e: Engine, shape: tuple[int, int, int], of: tuple[int, int], at: Callable[[PixelGrid], Contribution], down: bool,
-    is_steady: bool,
-) -> Any:  # fmt: skip
-    """Sums over every stride-th pixel of an image, shape = width, height, stride, of what `at` gives.
+@dataclass(frozen=True)
+class Runs(Numbers):
+    """Every stride-th pixel of an image in runs, each of one lane: along its rows, or down its columns.
 
-    of: see `sizes`. down: runs go down columns, not along rows. is_steady: no run leaves the block that it begins in.
+    along: pixels of a row, or of a column; lanes: that it is shared by, and one over that. total: of all lanes; alone:
+    whether each has one pixel.
     """
-    (width, height, stride), (size, values_each) = shape, of
-    columns, rows = -(-width // stride), -(-height // stride)
-    along, across = (rows, columns) if down else (columns, rows)
-    lanes = -(-along // _run(e, along, across))
-    lane = dr.arange(e.UInt, across * lanes)
-    line = lane // lanes
-    first = lane - line * lanes
+
+    COMPILED: ClassVar[tuple[str, ...]] = ("total", "down", "alone")
+
+    width: int
+    stride: int
+    columns: int
+    along: int
+    lanes: int
+    share: float
+    total: int
+    down: bool
+    alone: bool
+
+    @classmethod
+    def over(cls, e: Engine, width: int, height: int, stride: int, down: bool) -> Runs:
+        """Of an image of that size."""
+        columns, rows = -(-width // stride), -(-height // stride)
+        along, across = (rows, columns) if down else (columns, rows)
+        lanes = -(-along // _run(e, along, across))
+        return cls(width, stride, columns, along, lanes, 1.0 / lanes, across * lanes, down, lanes == along)
+
+
+def summed(e: Engine, runs: Runs, of: tuple[int, int], at: Callable[[PixelGrid], Contribution], is_steady: bool) -> Any:
+    """Sums over the pixels of what `at` gives.
+
+    of: see `sizes`. is_steady: no run leaves the block that it begins in.
+    """
+    size, values_each = of
+    lane = dr.arange(e.UInt, runs.total)
+    line = quotient(lane, runs.lanes, runs.share)
+    first = lane - line * runs.lanes
     sums = dr.zeros(e.Int, size)
 
     def add(slot: Any, values: tuple[Any, ...], active: Any) -> None:
@@ -279,10 +341,10 @@ def summed(
 
     def here(i: Any) -> Contribution:
         # Lanes beside each other read pixels beside each other.
-        k = first + i * lanes
-        meant, k = k < along, dr.minimum(k, along - 1)
-        column, row = (line, k) if down else (k, line)
-        return at(_pixels(width, columns, stride, column, row, meant))
+        k = first + i * runs.lanes
+        meant, k = k < runs.along, dr.minimum(k, runs.along - 1)
+        column, row = (line, k) if runs.down else (k, line)
+        return at(_pixels(runs.width, runs.columns, runs.stride, column, row, meant))
 
     def step(i: Any, slot: Any, total: tuple[Any, ...]) -> tuple[Any, Any, tuple[Any, ...]]:
         found = here(i)
@@ -298,13 +360,13 @@ def summed(
         total = dr.if_stmt((slot, total), left, written, lambda _, total: total)
         return i + 1, now, _plus(total, found.values)
 
-    if lanes == along:
+    if runs.alone:
         found = here(e.UInt(0))
         add(found.slot, found.values, found.compared)
         return sums
-    nothing = tuple(dr.zeros(e.Int, across * lanes) for _ in range(values_each))
-    start = e.UInt(0), dr.full(e.UInt, _NONE, across * lanes), nothing
-    _, slot, total = dr.while_loop(start, lambda i, *_: i * lanes < along, step)
+    nothing = tuple(dr.zeros(e.Int, runs.total) for _ in range(values_each))
+    start = e.UInt(0), dr.full(e.UInt, _NONE, runs.total), nothing
+    _, slot, total = dr.while_loop(start, lambda i, *_: i * runs.lanes < runs.along, step)
     add(slot, total, slot != _NONE)
     return sums
 

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
-from rsgen.device.arrays import Engine, Kernels
-from rsgen.device.lens import Lens, recorded_with
+from rsgen.device.arrays import Engine, Kernels, recorded_with
+from rsgen.device.lens import Lens
 from rsgen.device.projection import TO_BASE, gather, move, project_rolling
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.brightness import MID_GREY
@@ -26,10 +26,11 @@ from rstrack.images.device_frame import DeviceRig
 from rstrack.images.line_poses import from_base, to_base
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.images.sampling import (
+    PyramidLevel,
+    Raster,
     bilinear_value,
     depth_of,
     grid,
-    level_size,
     moved_to_base,
     nearest,
     pinhole_ray,
@@ -66,10 +67,12 @@ class MeetingInput(SpaceInput):
     values: Any
 
 
-def _moved(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bool, given: SpaceInput) -> tuple[Any, Any, Any]:
-    """1/z of every stride-th pixel of `lens`, where it is seen in `other`, and whether it is within that image."""
+def _moved(
+    e: Engine, lens: Lens, other: Lens, raster: Raster, has_rays: bool, given: SpaceInput
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """1/z of the pixels of `lens`, where they are seen in `other`, and whether they are within that image."""
     camera, there = lens.camera, other.camera
-    index, px, py = grid(e, camera.width, camera.height, stride)
+    index, px, py = grid(e, raster)
     rho = dr.gather(e.Float, given.inverse_depth, index)
     z, known = depth_of(rho)
     if has_rays:
@@ -90,14 +93,14 @@ def free_space_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays:
     has_rays: whether the image's rays are given; a rectified one's are those of its pinhole.
     """
 
-    @recorded_with(e, SpaceInput, lens, other)
-    def kernel(given: SpaceInput, lens: Lens, other: Lens) -> Any:
-        there = other.camera
-        rho, seen, inside = _moved(e, lens, other, stride, has_rays, given)
+    @recorded_with(e, SpaceInput, lens, other, Raster.of(lens.camera, stride))
+    def kernel(given: SpaceInput, lens: Lens, other: Lens, raster: Raster) -> Any:
+        there, reach = other.camera, e.Float(raster.stride)
+        rho, seen, inside = _moved(e, lens, other, raster, has_rays, given)
         # The nearest of what is seen about there: an edge may lie a pixel or two elsewhere.
         nearest_rho = e.Float(0.0)
-        for dy in (-stride, 0, stride):
-            for dx in (-stride, 0, stride):
+        for dy in (-reach, 0, reach):
+            for dx in (-reach, 0, reach):
                 x = dr.clip(seen.x + dx, 0.0, there.width - 1.0)
                 y = dr.clip(seen.y + dy, 0.0, there.height - 1.0)
                 at = nearest(e, there.width, x, y, inside)
@@ -113,16 +116,17 @@ def meeting_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bo
 
     `_UNKNOWN` where that is not known; a value of twice that outside the other image.
     """
-    columns = -(-other.camera.width // stride)
 
-    @recorded_with(e, MeetingInput, lens, other)
-    def kernel(given: MeetingInput, lens: Lens, other: Lens) -> Any:
-        _, seen, inside = _moved(e, lens, other, stride, has_rays, given)
+    @recorded_with(e, MeetingInput, lens, other, Raster.of(lens.camera, stride), Raster.of(other.camera, stride))
+    def kernel(given: MeetingInput, lens: Lens, other: Lens, raster: Raster, there: Raster) -> Any:
+        _, seen, inside = _moved(e, lens, other, raster, has_rays, given)
         value, met = surface(e, other.camera, given.other, seen.x, seen.y, inside)
         apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, _UNKNOWN)
-        column = e.UInt(e.Int(dr.select(inside, (seen.x + 0.5) / stride, 0.0)))
-        row = e.UInt(e.Int(dr.select(inside, (seen.y + 0.5) / stride, 0.0)))
-        handed = dr.select(inside, dr.gather(e.Float, given.values, row * columns + column, inside), 2.0 * _UNKNOWN)
+        column, row = (
+            e.UInt(e.Int(dr.select(inside, (v + 0.5) * there.per_stride, 0.0))) for v in (seen.x, seen.y)
+        )  # fmt: skip
+        value = dr.gather(e.Float, given.values, row * there.columns + column, inside)
+        handed = dr.select(inside, value, 2.0 * _UNKNOWN)
         return apart, handed
 
     return kernel
@@ -145,17 +149,16 @@ class IntensityInput:
 
 def intensity_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int, level: int) -> Callable[[IntensityInput], Any]:
     """Kernel → the colour image's intensity less the one expected, of each of the keyframe's points."""
-    width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
-    shrink = 0.5**level
+    of_lenses = lens, ref_lens, Raster.of(ref_lens.camera, stride), PyramidLevel.of(lens.camera, level)
 
-    @recorded_with(e, IntensityInput, lens, ref_lens)
-    def kernel(given: IntensityInput, lens: Lens, ref_lens: Lens) -> Any:
-        ref = ref_lens.camera
-        _, x, y = grid(e, ref.width, ref.height, stride)
+    @recorded_with(e, IntensityInput, *of_lenses)
+    def kernel(given: IntensityInput, lens: Lens, ref_lens: Lens, raster: Raster, image: PyramidLevel) -> Any:
+        _, x, y = grid(e, raster)
         p = moved_to_base(e, ref_lens, given.to_base, x, y, (given.x, given.y, given.z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         active = (given.z > 0.0) & seen.valid
-        value, active = bilinear_value(e, given.image, width, height, seen.x * shrink, seen.y * shrink, active)
+        u, v = seen.x * image.shrink, seen.y * image.shrink
+        value, active = bilinear_value(e, given.image, image.width, image.height, u, v, active)
         gain, offset = (dr.gather(e.Float, given.brightness, e.UInt(i)) for i in (0, 1))
         expected = given.intensity + dr.fma(gain, given.intensity - MID_GREY, offset)
         return dr.select(active & dr.isfinite(value), value - expected, _UNKNOWN)

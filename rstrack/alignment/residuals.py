@@ -22,20 +22,22 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine
-from rsgen.device.lens import Lens, per_focal, recorded_with
+from rsgen.device.arrays import Engine, recorded_with
+from rsgen.device.lens import Lens, per_focal
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project_rolling
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
+from rstrack.alignment.block_sums import Blocks, Contribution, PixelGrid, Runs, block_slot, contribution, room, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.images.sampling import (
     BEHIND,
     EDGE,
     NEAREST,
+    Blur,
+    PyramidLevel,
+    Raster,
     blur_length,
     blur_weight,
     grid,
-    level_size,
     moved_to_base,
     nearest,
     row_of_pixel,
@@ -80,9 +82,12 @@ def geometric_kernel(
     """
     count = WHOLE if shifts else 0
 
-    @recorded_with(e, GeometricInput, lens, ref_lens)
-    def kernel(given: GeometricInput, lens: Lens, ref_lens: Lens) -> Any:
-        camera, ref = lens.camera, ref_lens.camera
+    size, down = room(lens, ref_lens, count), lens.rolls and not lens.shutter.by_rows
+    runs, own_blocks = Runs.over(e, lens.camera.width, lens.camera.height, stride, down), Blocks.of(lens, ref_lens)
+
+    @recorded_with(e, GeometricInput, lens, ref_lens, runs, own_blocks)
+    def kernel(given: GeometricInput, lens: Lens, ref_lens: Lens, runs: Runs, blocks: Blocks) -> Any:
+        ref = ref_lens.camera
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
@@ -98,15 +103,13 @@ def geometric_kernel(
             r, g, is_smooth = plane_distance(e, given, ref, seen, value, active, even)
             # What lies behind the surface is hidden from the reference: nothing that it shows speaks for it or against.
             active &= r > -parameters[1]
-            slot = block_slot(line, seen.row, lens, ref_lens, pixels.y, columns=count)
+            slot = block_slot(line, seen.row, blocks, pixels.y, columns=count)
             columns = whole_image(g, p, to_base, z, (xn, yn), parameters[2]) if shifts else ()
             return contribution(
                 e, g, p, 1.0, r, active, parameters, slot, columns, judged=is_smooth, curved=count
             )  # fmt: skip
 
-        down = lens.lines > 1 and not lens.shutter.by_rows
-        shape, is_steady = (camera.width, camera.height, stride), ref_lens.lines == 1
-        return summed(e, shape, sizes(lens, ref_lens, count), at, down, is_steady)
+        return summed(e, runs, size, at, is_steady=not ref_lens.rolls)
 
     return kernel
 
@@ -188,13 +191,17 @@ def photometric_kernel(
     lens: the colour camera. level: of the pyramid (halved that often). blur_sigma_px: σ of equation (13), by which
     blurred points count less; 0: all alike.
     """
-    weighs_blur = blur_sigma_px > 0.0 and lens.lines > 1 and lens.shutter.exposure_s > 0.0
-    shrink = 0.5**level
+    weighs_blur = blur_sigma_px > 0.0 and lens.rolls and lens.shutter.exposure_s > 0.0
+    blur = Blur.of(lens, blur_sigma_px) if weighs_blur else Blur(0.0, 0.0)
+    size, down = room(lens, ref_lens, 2), lens.rolls and not lens.shutter.by_rows
+    runs = Runs.over(e, ref_lens.camera.width, ref_lens.camera.height, stride, down)
+    of_lenses = lens, ref_lens, runs, Blocks.of(lens, ref_lens), PyramidLevel.of(lens.camera, level), blur
 
-    @recorded_with(e, PhotometricInput, lens, ref_lens)
-    def kernel(given: PhotometricInput, lens: Lens, ref_lens: Lens) -> Any:
-        camera, ref = lens.camera, ref_lens.camera
-        width, height = level_size(camera.width, level), level_size(camera.height, level)
+    @recorded_with(e, PhotometricInput, *of_lenses)
+    def kernel(
+        given: PhotometricInput, lens: Lens, ref_lens: Lens, runs: Runs, blocks: Blocks, image: PyramidLevel, blur: Blur
+    ) -> Any:  # fmt: skip
+        shrink = image.shrink
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
         gain, offset = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (7, 8))
 
@@ -207,23 +214,24 @@ def photometric_kernel(
             p = moved_to_base(e, ref_lens, given.to_base, pixels.x, pixels.y, p)
             seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
             u, v = seen.x * shrink, seen.y * shrink
-            value, dx, dy, active = value_and_slope(e, given.image, width, height, u, v, active & seen.valid)
+            value, dx, dy, active = value_and_slope(
+                e, given.image, image.width, image.height, u, v, active & seen.valid
+            )
             dx, dy = dx * shrink, dy * shrink
             contrast = intensity - MID_GREY
             r = value - (intensity + dr.fma(gain, contrast, offset))  # (8), and brightness
             columns = -contrast, e.Float(-1.0)
             if weighs_blur:
                 # Of the squared error, so that σ stays that of sharp points.
-                share = dr.sqrt(blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / blur_sigma_px**2))  # (13)
+                share = dr.sqrt(blur_weight(blur_length(seen.pixel_speed, blur.lines), blur.inv_sigma2))  # (13)
                 r, dx, dy = r * share, dx * share, dy * share
                 columns = columns[0] * share, columns[1] * share
             g = seen.chain(dx, dy, 0.0)
-            slot = block_slot(seen.row, ref_line, lens, ref_lens, seen.y, columns=len(columns))
+            slot = block_slot(seen.row, ref_line, blocks, seen.y, columns=len(columns))
             # A twist of the camera moves the point the other way.
             return contribution(e, g, p, -1.0, r, active, parameters, slot, columns)
 
-        down = lens.lines > 1 and not lens.shutter.by_rows
-        return summed(e, (ref.width, ref.height, stride), sizes(lens, ref_lens, 2), at, down, False)
+        return summed(e, runs, size, at, is_steady=False)
 
     return kernel
 
@@ -248,10 +256,10 @@ def visibility_kernel(e: Engine, lens: Lens, ref_lens: Lens, stride: int) -> Cal
     Unknown counts as visible.
     """
 
-    @recorded_with(e, VisibilityInput, lens, ref_lens)
-    def kernel(given: VisibilityInput, lens: Lens, ref_lens: Lens) -> Any:
-        camera, ref = lens.camera, ref_lens.camera
-        _, x, y = grid(e, ref.width, ref.height, stride)
+    @recorded_with(e, VisibilityInput, lens, ref_lens, Raster.of(ref_lens.camera, stride))
+    def kernel(given: VisibilityInput, lens: Lens, ref_lens: Lens, raster: Raster) -> Any:
+        camera = lens.camera
+        _, x, y = grid(e, raster)
         p = moved_to_base(e, ref_lens, given.to_base, x, y, (given.x, given.y, given.z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         inside = seen.valid & (given.z > 0.0)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine
+from rsgen.device.arrays import Engine, Numbers, quotient
 from rsgen.device.lens import Lens, per_focal
 from rsgen.device.projection import TO_BASE, Vector, gather, move
 from rsgen.geometry.camera import Camera
@@ -19,13 +20,39 @@ BEHIND = 0.02
 NEAREST = 2.0
 
 
-def grid(e: Engine, width: int, height: int, stride: int) -> tuple[Any, Any, Any]:
-    """Index, x and y of every stride-th pixel of every stride-th row."""
-    columns = -(-width // stride)
-    i = dr.arange(e.UInt, columns * -(-height // stride))
-    row = i // columns
-    x, y = (i - row * columns) * stride, row * stride
-    return y * width + x, x, y
+@dataclass(frozen=True)
+class Raster(Numbers):
+    """Every stride-th pixel of every stride-th row of an image: its width, how many columns that are, one over both.
+
+    count: of the pixels.
+    """
+
+    COMPILED: ClassVar[tuple[str, ...]] = ("count",)
+
+    width: int
+    stride: int
+    columns: int
+    per_stride: float
+    per_column: float
+    count: int
+
+    @classmethod
+    def of(cls, camera: Camera, stride: int = 1) -> Raster:
+        """Of a camera's images."""
+        columns, rows = (-(-size // stride) for size in (camera.width, camera.height))
+        return cls(camera.width, stride, columns, 1.0 / stride, 1.0 / columns, columns * rows)
+
+
+def grid(e: Engine, raster: Raster) -> tuple[Any, Any, Any]:
+    """Index, x and y of the pixels."""
+    i = dr.arange(e.UInt, raster.count)
+    row = quotient(i, raster.columns, raster.per_column)
+    if not isinstance(raster.columns, int):
+        # Beyond four million it may be one off.
+        row = dr.select(row * raster.columns > i, row - 1, row)
+        row = dr.select(i - row * raster.columns >= raster.columns, row + 1, row)
+    x, y = (i - row * raster.columns) * raster.stride, row * raster.stride
+    return y * raster.width + x, x, y
 
 
 def pinhole_ray(e: Engine, camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
@@ -41,7 +68,7 @@ def depth_of(rho: Any) -> tuple[Any, Any]:
 
 def pinhole_points(e: Engine, camera: Camera, rho: Any) -> tuple[Vector, Any]:
     """Points that a rectified image's pixels see, by inverse depth `rho`, in its camera's frame; and which have any."""
-    _, x, y = grid(e, camera.width, camera.height, 1)
+    _, x, y = grid(e, Raster.of(camera))
     z, known = depth_of(rho)
     xn, yn = pinhole_ray(e, camera, x, y)
     return (xn * z, yn * z, z), known
@@ -49,12 +76,12 @@ def pinhole_points(e: Engine, camera: Camera, rho: Any) -> tuple[Vector, Any]:
 
 def row_of_pixel(e: Engine, lens: Lens, x: Any, y: Any) -> Any:
     """Number of the line that exposes a pixel; 0 where all are exposed at once."""
-    return e.UInt(0) if lens.lines == 1 else e.UInt(lens.line_of(e.Int(x), e.Int(y)))
+    return e.UInt(lens.line_of(e.Int(x), e.Int(y))) if lens.rolls else e.UInt(0)
 
 
 def moved_to_base(e: Engine, lens: Lens, to_base: Any, x: Any, y: Any, p: Vector) -> Vector:
     """Points that pixels of an image see, in the base frame, by the poses of their own lines; p if it is rectified."""
-    if lens.lines == 1:
+    if not lens.rolls:
         return p
     return move(gather(to_base, row_of_pixel(e, lens, x, y), TO_BASE, stride=TO_BASE), p)
 
@@ -131,6 +158,20 @@ def surface(e: Engine, camera: Camera, rho: Any, x: Any, y: Any, active: Any) ->
     return dr.fma(bottom - top, fy, top), active
 
 
+@dataclass(frozen=True)
+class PyramidLevel(Numbers):
+    """Width and height of a level of a camera's images, and how large its pixels are against theirs, inverted."""
+
+    width: int
+    height: int
+    shrink: float
+
+    @classmethod
+    def of(cls, camera: Camera, level: int) -> PyramidLevel:
+        """Halved so many times."""
+        return cls(level_size(camera.width, level), level_size(camera.height, level), 0.5**level)
+
+
 def level_size(size: int, level: int) -> int:
     """Width or height of a pyramid level: halved and rounded up, as cv2.pyrDown does."""
     return -(-size // 2**level)
@@ -145,7 +186,23 @@ def blur_weight(length_px: Any, inv_sigma2: Any) -> Any:
     return dr.exp(-inv_sigma2 * length_px)
 
 
-def blur_length(lens: Lens, pixel_speed: tuple[Any, Any]) -> Any:
-    """‖x_t − x_{t−t_e}‖ in pixels of points that move by pixel_speed (px) per line delay (`project_rolling`)."""
+def blur_length(pixel_speed: tuple[Any, Any], lines: Any) -> Any:
+    """‖x_t − x_{t−t_e}‖ in pixels of points that move by pixel_speed (px) per line delay (`project_rolling`).
+
+    lines: line delays that a line is exposed for.
+    """
     u, v = pixel_speed
-    return dr.sqrt(u * u + v * v) * (lens.shutter.exposure_s / lens.shutter.line_delay(lens.camera))
+    return dr.sqrt(u * u + v * v) * lines
+
+
+@dataclass(frozen=True)
+class Blur(Numbers):
+    """`blur_length`'s lines and `blur_weight`'s 1/σ²."""
+
+    lines: float
+    inv_sigma2: float
+
+    @classmethod
+    def of(cls, lens: Lens, sigma_px: float) -> Blur:
+        """Of a camera's images; sigma_px: σ of equation (13)."""
+        return cls(lens.shutter.exposure_s / lens.shutter.line_delay(lens.camera), 1.0 / sigma_px**2)

@@ -12,14 +12,15 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine
-from rsgen.device.lens import Lens, per_focal, recorded_with
+from rsgen.device.arrays import Engine, recorded_with
+from rsgen.device.lens import Lens, per_focal
 from rsgen.device.projection import TO_BASE, gather, move, project, project_rolling
 from rstrack.images.sampling import (
+    PyramidLevel,
+    Raster,
     bilinear_value,
     depth_of,
     grid,
-    level_size,
     moved_to_base,
     nearest,
     pinhole_ray,
@@ -42,7 +43,7 @@ def _ray(e: Engine, lens: Lens, rays: tuple[Any, Any], x: Any, y: Any, active: A
 
 def _pose(e: Engine, lens: Lens, to_base: Any, x: Any, y: Any) -> list[Any]:
     """T_base_cam at a pixel's own time, between the lines' poses."""
-    if lens.lines == 1:
+    if not lens.rolls:
         return gather(to_base, e.UInt(0), TO_BASE, stride=TO_BASE)
     line = dr.clip(lens.line_of(x, y), 0.0, lens.lines - 1.0)
     low = e.UInt(e.Int(dr.minimum(dr.floor(line), lens.lines - 2.0)))
@@ -76,10 +77,10 @@ def rectify_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[RectifyInput]
     0 where the source shows nothing. `base` is a global-shutter pinhole.
     """
 
-    @recorded_with(e, RectifyInput, lens, base)
-    def kernel(given: RectifyInput, lens: Lens, base: Lens) -> Any:
+    @recorded_with(e, RectifyInput, lens, base, Raster.of(base.camera))
+    def kernel(given: RectifyInput, lens: Lens, base: Lens, raster: Raster) -> Any:
         camera = base.camera
-        _, px, py = grid(e, camera.width, camera.height, 1)
+        _, px, py = grid(e, raster)
         goal_x, goal_y = e.Float(px), e.Float(py)
         x, y = _first_guess(e, lens, base, goal_x, goal_y)
         width, height = lens.camera.width, lens.camera.height
@@ -121,17 +122,15 @@ class ColorInput:
 def color_kernel(e: Engine, lens: Lens, base: Lens, level: int = 0) -> Callable[[ColorInput], Any]:
     """Kernel → (intensity, valid 0/1) at the pixels of the reference `base`, looked up by equation (3) in the image's
     pyramid at `level`."""
-    width, height = level_size(lens.camera.width, level), level_size(lens.camera.height, level)
-    shrink = 0.5**level
 
-    @recorded_with(e, ColorInput, lens, base)
-    def kernel(given: ColorInput, lens: Lens, base: Lens) -> Any:
+    @recorded_with(e, ColorInput, lens, base, Raster.of(base.camera), PyramidLevel.of(lens.camera, level))
+    def kernel(given: ColorInput, lens: Lens, base: Lens, raster: Raster, image: PyramidLevel) -> Any:
         z, active = depth_of(given.inverse_depth)
-        _, x, y = grid(e, base.camera.width, base.camera.height, 1)
+        _, x, y = grid(e, raster)
         p = moved_to_base(e, base, given.to_base, x, y, (given.rays_x * z, given.rays_y * z, z))
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
-        u, v = seen.x * shrink, seen.y * shrink
-        value, active = bilinear_value(e, given.image, width, height, u, v, active & seen.valid)
+        u, v = seen.x * image.shrink, seen.y * image.shrink
+        value, active = bilinear_value(e, given.image, image.width, image.height, u, v, active & seen.valid)
         active &= dr.isfinite(value)  # not clipped
         return dr.select(active, value, 0.0), dr.select(active, e.Float(1.0), 0.0)
 
@@ -160,11 +159,11 @@ def fuse_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[FusionInput], An
     measurements of unit quality, 1/σ_z² over that of a pixel at one metre.
     """
 
-    @recorded_with(e, FusionInput, lens, base)
-    def kernel(given: FusionInput, lens: Lens, base: Lens) -> Any:
+    @recorded_with(e, FusionInput, lens, base, Raster.of(base.camera))
+    def kernel(given: FusionInput, lens: Lens, base: Lens, raster: Raster) -> Any:
         rho, weight = given.inverse_depth, given.weight
         gate, limit = dr.gather(e.Float, given.constants, e.UInt(0)), dr.gather(e.Float, given.constants, e.UInt(1))
-        _, px, py = grid(e, base.camera.width, base.camera.height, 1)
+        _, px, py = grid(e, raster)
         xn, yn = pinhole_ray(e, base.camera, px, py)
         z, active = depth_of(rho)
         seen = project_rolling(lens, given.from_base, (xn * z, yn * z, z), e.UInt, e.Int)

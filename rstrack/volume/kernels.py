@@ -17,7 +17,7 @@ import drjit as dr
 from rsgen.device.arrays import Engine, recorded
 from rsgen.device.lens import Lens
 from rsgen.device.projection import Vector, gather, move, project
-from rstrack.images.sampling import EDGE, depth_of, grid, nearest, pinhole_ray, surface
+from rstrack.images.sampling import EDGE, Raster, depth_of, grid, nearest, pinhole_ray, surface
 
 BLOCK = 8
 POINTS = BLOCK**3
@@ -50,7 +50,7 @@ def scale_kernel(e: Engine, lens: Lens) -> Callable[..., Any]:
 
     @recorded
     def kernel(rho: Any) -> Any:
-        index, px, py = grid(e, w, h, 1)
+        index, px, py = grid(e, Raster.of(camera))
         at = dr.gather(e.Float, rho, index)
         slopes, smooth = [], e.Bool(True)
         for coordinate, size, stride, focal in ((px, w, 1, camera.fx), (py, h, w, camera.fy)):
@@ -81,7 +81,7 @@ def visible_blocks_kernel(e: Engine, lens: Lens, band_m: float, voxel_m: float) 
 
     @recorded
     def kernel(rho: Any, pose: Any, box: Any) -> Any:
-        index, px, py = grid(e, camera.width, camera.height, _STRIDE)
+        index, px, py = grid(e, Raster.of(camera, _STRIDE))
         at = dr.gather(e.Float, rho, index)
         z, active = depth_of(at)
         xn, yn = pinhole_ray(e, camera, px, py)
@@ -160,7 +160,7 @@ def raycast_kernel(e: Engine, lens: Lens, voxel_m: float, truncation_m: float, c
 
     @recorded
     def kernel(pose: Any, box: Any, near: Any, directory: Any, sums: Any) -> Any:
-        _, px, py = grid(e, camera.width, camera.height, 1)
+        _, px, py = grid(e, Raster.of(camera))
         xn, yn = pinhole_ray(e, camera, px, py)
         M, limits = gather(pose, e.UInt(0), 12), _integers(e, box, 6)
         length = dr.sqrt(xn * xn + yn * yn + 1.0) * (1.0 / voxel_m)

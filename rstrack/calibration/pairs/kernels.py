@@ -19,7 +19,7 @@ import drjit as dr
 from rsgen.device.arrays import Engine, recorded_from
 from rsgen.device.lens import Lens, TracedCamera
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
-from rstrack.alignment.block_sums import Contribution, PixelGrid, block_slot, contribution, sizes, summed
+from rstrack.alignment.block_sums import Blocks, Contribution, PixelGrid, Runs, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.images import ACROSS
@@ -230,7 +230,7 @@ def color_residual(
 def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: int) -> Callable[[DepthPairInput], Any]:
     """Kernel of the depth term: for each pair the sums over pairs of blocks (current, reference) of depth lines."""
     names = asked.depth
-    of = sizes(depth, depth, len(names))
+    of, blocks = sizes(depth, depth, len(names)), Blocks.of(depth, depth)
 
     @recorded_from(DepthPairInput)
     def kernel(given: DepthPairInput) -> Any:
@@ -245,7 +245,7 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: 
                 here, there = (moves(names, of_pixel.lens.camera, one) for one in own)
                 shifts = zip(there, here, strict=True)
                 columns = unknown_columns(e, of_pixel.g, shifts, seen.M, point.T_base_cam, given.constants)
-            slot = grid.launched * of[0] + block_slot(point.line, seen.row, depth, depth, grid.y, len(names))
+            slot = grid.launched * of[0] + block_slot(point.line, seen.row, blocks, grid.y, len(names))
             judged = of_pixel.is_smooth, len(names)
             motion = of_pixel.g, point.p, 1.0, of_pixel.r, of_pixel.active
             return contribution(e, *motion, parameters, slot, columns, *judged)
@@ -263,7 +263,7 @@ def color_pair_kernel(
     Its further columns: what is asked of the colour camera's lens, then gain and offset of the current image.
     """
     names = asked.color
-    size = sizes(color, color, len(names) + 2)
+    size, blocks = sizes(color, color, len(names) + 2), Blocks.of(color, color)
 
     @recorded_from(ColorPairInput)
     def kernel(given: ColorPairInput) -> Any:
@@ -278,7 +278,7 @@ def color_pair_kernel(
                 shifts = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
                 columns = unknown_columns(e, (a, b, c), shifts, here.M, turned_round(there.M), given.constants)
             columns += [-of.contrast, e.Float(-1.0)]
-            slot = grid.launched * size[0] + block_slot(here.row, there.row, color, color, here.y, len(columns))
+            slot = grid.launched * size[0] + block_slot(here.row, there.row, blocks, here.y, len(columns))
             # A twist of the camera moves the point the other way.
             return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns, True, len(names))
 
@@ -296,5 +296,5 @@ def _summed(
     """
     width, height = (-(-size // stride) * stride for size in (depth.camera.width, depth.camera.height))
     by_rows = depth.shutter.by_rows
-    shape = (width, height * pairs, stride) if by_rows else (width * pairs, height, stride)
-    return summed(e, shape, (of[0] * pairs, of[1]), at, not by_rows, False)
+    size = (width, height * pairs) if by_rows else (width * pairs, height)
+    return summed(e, Runs.over(e, *size, stride, not by_rows), (of[0] * pairs, of[1]), at, is_steady=False)

@@ -25,7 +25,7 @@ from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.alignment import block_sums as block_sums_module
 from rstrack.alignment import residuals
-from rstrack.alignment.block_sums import BlockSums, Contribution, PixelGrid, Scaling, block_counts
+from rstrack.alignment.block_sums import BlockSums, Contribution, PixelGrid, Runs, Scaling, block_counts
 from rstrack.alignment.normal_equations import Slopes, chain
 from rstrack.alignment.weights import LEAST_CURVATURE, NU, weight
 from rstrack.images import line_poses as lines
@@ -320,7 +320,7 @@ def test_runs_of_pixels_add_up_to_what_pixels_do(
         dr.scatter_add(seen, ENGINE.Int(1), pixels.y * width + pixels.x, pixels.meant & (pixels.index < len(seen)))
         return Contribution(slot, tuple(dr.select(compared, v, 0) for v in (a, b)), compared)
 
-    got = block_sums_module.summed(ENGINE, (width, height, stride), (12, 2), at, down, False)
+    got = block_sums_module.summed(ENGINE, Runs.over(ENGINE, width, height, stride, down), (12, 2), at, False)
     assert np.array_equal(got.numpy().reshape(6, 2), want)
     assert np.array_equal(seen.numpy().reshape(height, width)[::stride, ::stride], np.ones_like(x))
     assert seen.numpy().sum() == x.size

@@ -22,7 +22,7 @@ from rstrack.alignment import residuals
 from rstrack.alignment.linearise import Linearised
 from rstrack.alignment.weights import LEAST_CURVATURE, NU, scale_step, weight
 from rstrack.images import line_poses as lines
-from rstrack.images.sampling import blur_length, blur_weight
+from rstrack.images.sampling import Blur, blur_length, blur_weight
 
 
 @pytest.fixture(autouse=True)
@@ -94,7 +94,7 @@ def test_blur_weights_are_those_of_equation_13(scan: str) -> None:
     table = ENGINE.upload(lines.from_base_table(s.truth, s.ref.T_world_base, s.image.exposure))
     seen = project_rolling(lens, table, (points.x, points.y, points.z), ENGINE.UInt, ENGINE.Int)
     on = (points.z.numpy() > 0) & seen.valid.numpy()
-    found = blur_weight(blur_length(lens, seen.pixel_speed), 1.0 / sigma_px**2).numpy()[on]
+    found = blur_weight(blur_length(seen.pixel_speed, Blur.of(lens, sigma_px).lines), 1.0 / sigma_px**2).numpy()[on]
     p_base = np.stack([a.numpy()[on] for a in (points.x, points.y, points.z)], axis=-1).astype(float)
     p_world = se3.transform(s.ref.T_world_base, p_base)
     middle = lens.shutter.line_mid_time(stamp, seen.line.numpy()[on].astype(float), lens.camera)

@@ -1,11 +1,15 @@
-"""`rstrack.images.sampling` against what is known of cubic convolution."""
+"""`rstrack.images.sampling`: cubic convolution, and the pixels of a raster."""
 
 from __future__ import annotations
 
+import drjit as dr
 import numpy as np
+import pytest
+from rstrack_util import ENGINE
 
 from rsgen.device.arrays import engine
-from rstrack.images.sampling import cubic_value_and_slope, value_and_slope
+from rsgen.geometry.camera import Camera
+from rstrack.images.sampling import Raster, cubic_value_and_slope, grid, value_and_slope
 
 SIZE = 16, 12
 
@@ -57,3 +61,16 @@ def test_slopes_are_those_of_the_values_and_pixels_are_passed_through() -> None:
 def test_only_where_all_sixteen_pixels_are_there() -> None:
     x, y = np.array([0.9, 1.0, 13.9, 14.0, 5.0, 5.0]), np.array([5.0, 5.0, 5.0, 5.0, 0.5, 10.0])
     assert looked_up(np.ones(SIZE[::-1]), x, y)[3].tolist() == [False, True, True, False, False, False]
+
+
+@pytest.mark.parametrize(("width", "height", "stride"), [(7, 5, 1), (641, 481, 2), (4000, 3001, 1)])
+def test_a_raster_that_is_handed_over_has_the_pixels_of_one_that_is_compiled_in(
+    width: int, height: int, stride: int
+) -> None:
+    raster = Raster.of(Camera(width, height, 500.0, 500.0, width / 2, height / 2), stride)
+    y, x = np.mgrid[:height:stride, :width:stride].reshape(2, -1)
+    numbers = [(ENGINE.UInt if isinstance(one, int) else ENGINE.Float)(one) for one in raster.numbers]
+    dr.make_opaque(numbers)
+    for one in (raster, raster.traced(numbers)):
+        for got, want in zip(grid(ENGINE, one), (y * width + x, x, y), strict=True):
+            np.testing.assert_array_equal(got.numpy(), want)
