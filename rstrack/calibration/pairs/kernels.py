@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine, recorded_from
+from rsgen.device.arrays import Engine, Numbers, quotient, recorded_with
 from rsgen.device.lens import Lens, TracedCamera
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
 from rstrack.alignment.block_sums import Blocks, Contribution, PixelGrid, Runs, block_slot, contribution, sizes, summed
@@ -24,7 +24,7 @@ from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.images import ACROSS
 from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
-from rstrack.images.sampling import cubic_value_and_slope, level_size, surface
+from rstrack.images.sampling import PyramidLevel, cubic_value_and_slope, surface
 
 
 @dataclass(frozen=True)
@@ -85,15 +85,42 @@ class PairGrid:
     meant: Any
 
 
-def pair_grid(e: Engine, lens: Lens, stride: int, pixels: PixelGrid, given: Given) -> PairGrid:
+@dataclass(frozen=True)
+class Compared(Numbers):
+    """Every stride-th pixel of every stride-th row of depth images, which stand below each other or side by side.
+
+    points: of one image. share, per_column, per_row: one over the numbers before them.
+    """
+
+    COMPILED = ("by_rows",)
+
+    stride: int
+    share: float
+    columns: int
+    per_column: float
+    rows: int
+    per_row: float
+    points: int
+    by_rows: bool
+
+    @classmethod
+    def of(cls, lens: Lens, stride: int) -> Compared:
+        """Of a depth camera."""
+        columns, rows = (-(-size // stride) for size in (lens.camera.width, lens.camera.height))
+        shares = 1.0 / stride, 1.0 / columns, 1.0 / rows
+        return cls(stride, shares[0], columns, shares[1], rows, shares[2], columns * rows, lens.shutter.by_rows)
+
+
+def pair_grid(e: Engine, compared: Compared, pixels: PixelGrid, given: Given) -> PairGrid:
     """From pixels of images that stand below each other, or beside each other, in order of the pairs."""
-    camera = lens.camera
-    columns, rows = -(-camera.width // stride), -(-camera.height // stride)
-    column, row = pixels.x // stride, pixels.y // stride
-    if lens.shutter.by_rows:
-        launched, row = row // rows, row % rows
+    stride, columns = compared.stride, compared.columns
+    column, row = (quotient(v, stride, compared.share) for v in (pixels.x, pixels.y))
+    if compared.by_rows:
+        launched = quotient(row, compared.rows, compared.per_row)
+        row = row - launched * compared.rows
     else:
-        launched, column = column // columns, column % columns
+        launched = quotient(column, columns, compared.per_column)
+        column = column - launched * columns
     first, last = (dr.gather(e.UInt, given.launch, e.UInt(i)) for i in range(2))
     pair = dr.minimum(first + launched, last)
     current, reference = (dr.gather(e.UInt, given.pairs, 2 * pair + i) for i in range(2))
@@ -117,11 +144,11 @@ class Point:
     active: Any
 
 
-def _points(e: Engine, depth: Lens, stride: int, pixels: PairGrid, view: Any, asked: Asked, given: Given) -> Point:
+def _points(
+    e: Engine, depth: Lens, compared: Compared, pixels: PairGrid, view: Any, asked: Asked, given: Given
+) -> Point:  # fmt: skip
     """Of pixels of a view's depth image."""
-    camera = depth.camera
-    points = -(-camera.width // stride) * -(-camera.height // stride)
-    z = dr.gather(e.Float, given.depth, view * points + pixels.number)
+    z = dr.gather(e.Float, given.depth, view * compared.points + pixels.number)
     xn, yn = (dr.gather(e.Float, rays, pixels.number) for rays in (given.rays_x, given.rays_y))
     active = pixels.meant & (z > 0.0)
     z = without_error(e, asked, z, xn, yn, given.error)
@@ -131,12 +158,12 @@ def _points(e: Engine, depth: Lens, stride: int, pixels: PairGrid, view: Any, as
     return Point(line, xn, yn, z, q, move(T_base_cam, q), T_base_cam, active)
 
 
-def in_atlas(view: Any, width: int, height: int, x: Any, y: Any) -> tuple[Any, Any]:
+def in_atlas(view: Any, width: Any, height: Any, x: Any, y: Any) -> tuple[Any, Any]:
     """Where pixels (x, y) of a view's image are in an atlas of images of that size."""
     return x + type(x)(view % ACROSS * width), y + type(y)(view // ACROSS * height)
 
 
-def _inside(width: int, height: int, margin: float, x: Any, y: Any) -> Any:
+def _inside(width: Any, height: Any, margin: float, x: Any, y: Any) -> Any:
     """Whether all that is interpolated between lies in one image, and not in the atlas's next."""
     return (x >= margin) & (y >= margin) & (x < width - 1.0 - margin) & (y < height - 1.0 - margin)
 
@@ -159,12 +186,12 @@ class DepthResidual:
 
 
 def depth_residual(
-    e: Engine, depth: Lens, stride: int, pixels: PairGrid, asked: Asked, given: DepthPairInput
+    e: Engine, depth: Lens, compared: Compared, pixels: PairGrid, asked: Asked, given: DepthPairInput
 ) -> DepthResidual:
     """Equation (6) with rows' times on both sides."""
     lens = traced(e, depth, given.camera)
     width, height = depth.camera.width, depth.camera.height
-    at = _points(e, depth, stride, pixels, pixels.current, asked, given)
+    at = _points(e, depth, compared, pixels, pixels.current, asked, given)
     first = pixels.reference * depth.lines
     seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, first)
     active = at.active & seen.valid & _inside(width, height, 0.0, seen.x, seen.y)
@@ -202,11 +229,11 @@ class ColorResidual:
 
 
 def color_residual(
-    e: Engine, color: Lens, depth: Lens, stride: int, pixels: PairGrid, level: int, asked: Asked, given: ColorPairInput
-) -> ColorResidual:
+    e: Engine, color: Lens, depth: Lens, compared: Compared, pixels: PairGrid, level: PyramidLevel, asked: Asked,
+    given: ColorPairInput,
+) -> ColorResidual:  # fmt: skip
     """Intensities of the level, the reference's with the gain and offset that the current image has."""
-    width, height = level_size(color.camera.width, level), level_size(color.camera.height, level)
-    shrink = 0.5**level
+    width, height, shrink = level.width, level.height, level.shrink
 
     def looked_up(view: Any, active: Any) -> tuple[RollingProjection, Any, Vector, Any]:
         seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, view * color.lines)
@@ -218,7 +245,7 @@ def color_residual(
         return seen, value, seen.chain(dx * shrink, dy * shrink, 0.0), active
 
     lens = traced(e, color, given.camera)
-    at = _points(e, depth, stride, pixels, pixels.reference, asked, given)
+    at = _points(e, depth, compared, pixels, pixels.reference, asked, given)
     here, value, own, active = looked_up(pixels.current, at.active)
     there, ref, other, active = looked_up(pixels.reference, active)
     gain, offset = (dr.gather(e.Float, given.own, 3 * pixels.pair + i) for i in (1, 2))
@@ -227,30 +254,48 @@ def color_residual(
     return ColorResidual(lens, at.p, here, there, r, own, other, gain, contrast, active)
 
 
+@dataclass(frozen=True)
+class PairSize(Numbers):
+    """Integers that a pair's sums have."""
+
+    size: int
+
+
+def _room(pairs: int, size: int) -> int:
+    """Integers of so many pairs, which have `size` each, with some to spare: their number is compiled in.
+
+    But no more than Dr.Jit may keep for each thread.
+    """
+    return min(1 << (pairs - 1).bit_length(), max(pairs, dr.expand_threshold() // size)) * size
+
+
 def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: int) -> Callable[[DepthPairInput], Any]:
     """Kernel of the depth term: for each pair the sums over pairs of blocks (current, reference) of depth lines."""
     names = asked.depth
-    of, blocks = sizes(depth, depth, len(names)), Blocks.of(depth, depth)
+    size, values = sizes(depth, depth, len(names))
+    of_lens = depth, Compared.of(depth, stride), Blocks.of(depth, depth), _runs(e, depth, stride, pairs)
 
-    @recorded_from(DepthPairInput)
-    def kernel(given: DepthPairInput) -> Any:
+    @recorded_with(e, DepthPairInput, *of_lens, PairSize(size))
+    def kernel(
+        given: DepthPairInput, depth: Lens, compared: Compared, blocks: Blocks, runs: Runs, pair: PairSize
+    ) -> Any:  # fmt: skip
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
-            grid = pair_grid(e, depth, stride, pixels, given)
-            of_pixel = depth_residual(e, depth, stride, grid, asked, given)
+            grid = pair_grid(e, compared, pixels, given)
+            of_pixel = depth_residual(e, depth, compared, grid, asked, given)
             point, seen, columns = of_pixel.at, of_pixel.seen, []
             if names:
                 own = project(of_pixel.lens.camera, point.q), seen.at
                 here, there = (moves(names, of_pixel.lens.camera, one) for one in own)
                 shifts = zip(there, here, strict=True)
                 columns = unknown_columns(e, of_pixel.g, shifts, seen.M, point.T_base_cam, given.constants)
-            slot = grid.launched * of[0] + block_slot(point.line, seen.row, blocks, grid.y, len(names))
+            slot = grid.launched * pair.size + block_slot(point.line, seen.row, blocks, grid.y, len(names))
             judged = of_pixel.is_smooth, len(names)
             motion = of_pixel.g, point.p, 1.0, of_pixel.r, of_pixel.active
             return contribution(e, *motion, parameters, slot, columns, *judged)
 
-        return _summed(e, depth, stride, pairs, of, at)
+        return summed(e, runs, (_room(pairs, size), values), at, is_steady=False)
 
     return kernel
 
@@ -263,38 +308,38 @@ def color_pair_kernel(
     Its further columns: what is asked of the colour camera's lens, then gain and offset of the current image.
     """
     names = asked.color
-    size, blocks = sizes(color, color, len(names) + 2), Blocks.of(color, color)
+    size, values = sizes(color, color, len(names) + 2)
+    of_depth = depth, Compared.of(depth, stride), _runs(e, depth, stride, pairs)
+    of_color = color, PyramidLevel.of(color.camera, level), Blocks.of(color, color), PairSize(size)
 
-    @recorded_from(ColorPairInput)
-    def kernel(given: ColorPairInput) -> Any:
+    @recorded_with(e, ColorPairInput, *of_depth, *of_color)
+    def kernel(
+        given: ColorPairInput, depth: Lens, compared: Compared, runs: Runs, color: Lens, image: PyramidLevel,
+        blocks: Blocks, pair: PairSize,
+    ) -> Any:  # fmt: skip
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
-            grid = pair_grid(e, depth, stride, pixels, given)
-            of = color_residual(e, color, depth, stride, grid, level, asked, given)
+            grid = pair_grid(e, compared, pixels, given)
+            of = color_residual(e, color, depth, compared, grid, image, asked, given)
             here, there, columns = of.here, of.there, []
             a, b, c = (0.5 * dr.fma(1.0 + of.gain, two, one) for one, two in zip(of.own, of.other, strict=True))
             if names:
                 shifts = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
                 columns = unknown_columns(e, (a, b, c), shifts, here.M, turned_round(there.M), given.constants)
             columns += [-of.contrast, e.Float(-1.0)]
-            slot = grid.launched * size[0] + block_slot(here.row, there.row, blocks, here.y, len(columns))
+            slot = grid.launched * pair.size + block_slot(here.row, there.row, blocks, here.y, len(columns))
             # A twist of the camera moves the point the other way.
             return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns, True, len(names))
 
-        return _summed(e, depth, stride, pairs, size, at)
+        return summed(e, runs, (_room(pairs, size), values), at, is_steady=False)
 
     return kernel
 
 
-def _summed(
-    e: Engine, depth: Lens, stride: int, pairs: int, of: tuple[int, int], at: Callable[[PixelGrid], Contribution]
-) -> Any:
-    """Sums over depth images' pixels, the images below each other if they are read by rows, else beside each other.
-
-    of: see `sizes`, of one pair.
-    """
+def _runs(e: Engine, depth: Lens, stride: int, pairs: int) -> Runs:
+    """Depth images' pixels, the images below each other if they are read by rows, else beside each other."""
     width, height = (-(-size // stride) * stride for size in (depth.camera.width, depth.camera.height))
     by_rows = depth.shutter.by_rows
     size = (width, height * pairs) if by_rows else (width * pairs, height)
-    return summed(e, Runs.over(e, *size, stride, not by_rows), (of[0] * pairs, of[1]), at, is_steady=False)
+    return Runs.over(e, *size, stride, not by_rows)

@@ -18,7 +18,12 @@ from rstrack.alignment.block_sums import Scaling, block_counts, sizes
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
 from rstrack.calibration.pairs.chain import PairSums, pair_sums
 from rstrack.calibration.pairs.images import LinePoses, WindowImages, pair_lens
-from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, color_pair_kernel, depth_pair_kernel
+from rstrack.calibration.pairs.kernels import (
+    ColorPairInput,
+    DepthPairInput,
+    color_pair_kernel,
+    depth_pair_kernel,
+)
 from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, units
 from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
@@ -134,7 +139,7 @@ class PairTerms:
         raw = [kernel(replace(given, launch=self.e.UInt(launch))) for launch in launches]
 
         def found() -> PairSums:
-            whole = np.concatenate([one.numpy() for one in raw])[: len(pairs) * size]
+            whole = np.concatenate([one.numpy()[: each * size] for one in raw])[: len(pairs) * size]
             apart = what[0] is color_pair_kernel
             return pair_sums(whole, scaling, pairs, block_counts(lens, lens)[0], unit, apart)
 

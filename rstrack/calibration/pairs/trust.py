@@ -18,11 +18,12 @@ from rsgen.array_types import FloatArray, IntArray
 from rstrack.alignment.block_sums import PixelGrid, Scaling, every
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
 from rstrack.calibration.pairs.images import ACROSS, LinePoses, lines_of
-from rstrack.calibration.pairs.kernels import color_residual, depth_residual, in_atlas, pair_grid
+from rstrack.calibration.pairs.kernels import Compared, color_residual, depth_residual, in_atlas, pair_grid
 from rstrack.calibration.pairs.optics import turn
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import Parameters
+from rstrack.images.sampling import PyramidLevel
 
 
 def trust_in(window: RecordingWindow, terms: PairTerms, p: Parameters) -> float:
@@ -55,8 +56,9 @@ def _by_depth(
     """Derivatives (n, 6) of depth's residuals over σ by a twist, with the slopes of either image."""
     e, camera, sigma = terms.e, terms.depth.camera, window.sigma[0]
     given = terms.depth_input(window.images, pair, lines, terms.optics(p), np.inf, Scaling(lever, 1.0, 1))
-    grid = pair_grid(e, terms.depth, terms.stride, _pixels(terms), given)
-    of = depth_residual(e, terms.depth, terms.stride, grid, terms.asked, given)
+    compared = Compared.of(terms.depth, terms.stride)
+    grid = pair_grid(e, compared, _pixels(terms), given)
+    of = depth_residual(e, terms.depth, compared, grid, terms.asked, given)
     at, (x, y) = of.at, in_atlas(grid.current, camera.width, camera.height, grid.x, grid.y)
     own = y * (ACROSS * camera.width) + x
     own_x, own_y = (dr.gather(e.Float, slope, own) for slope in (given.slope_x, given.slope_y))
@@ -74,8 +76,9 @@ def _by_color(
     e, optics, sigma = terms.e, terms.optics(p), window.sigma[1]
     same, scaling = np.zeros_like(window.brightness), Scaling(lever, 1.0, 1)
     given = terms.color_input(window.images, 0, pair, lines, optics, same, sigma, scaling)
-    grid = pair_grid(e, terms.depth, terms.stride, _pixels(terms), given)
-    of = color_residual(e, terms.color, terms.depth, terms.stride, grid, 0, terms.asked, given)
+    compared, level = Compared.of(terms.depth, terms.stride), PyramidLevel.of(terms.color.camera, 0)
+    grid = pair_grid(e, compared, _pixels(terms), given)
+    of = color_residual(e, terms.color, terms.depth, compared, grid, level, terms.asked, given)
     return _twists(of.p, of.own, of.other, of.active & (abs(of.r) < GATE_INTENSITY), sigma)
 
 
