@@ -101,20 +101,6 @@ def engine(backend: Backend = "auto") -> Engine:
     return Engine(name, module.Float, module.UInt, module.Int, module.Bool)
 
 
-def recorded_from(inputs: type[Inputs]) -> Callable[[Callable[[Inputs], Any]], Callable[[Inputs], Any]]:
-    """`recorded` for a function whose one argument is a dataclass of Dr.Jit arrays: named, not in an order to remember.
-
-    The arrays are handed over one by one: `drjit.freeze` takes 50 µs to look into a dataclass.
-    """
-    names = [field.name for field in fields(inputs)]  # type: ignore[arg-type]
-
-    def decorate(function: Callable[[Inputs], Any]) -> Callable[[Inputs], Any]:
-        frozen = recorded(lambda *arrays: function(inputs(*arrays)))
-        return lambda given: frozen(*(getattr(given, name) for name in names))
-
-    return decorate
-
-
 class Numbers:
     """A dataclass whose numbers kernels are handed, and read as cheaply as constants: others need no other kernel.
 
@@ -139,7 +125,10 @@ class Numbers:
 def recorded_with(
     e: Engine, inputs: type[Inputs], *what: Numbers
 ) -> Callable[[Callable[..., Any]], Callable[[Inputs], Any]]:  # fmt: skip
-    """`recorded_from` for a function of a dataclass of arrays and of `what`, which has the device's numbers then."""
+    """`recorded` for a function of a dataclass of arrays and of `what`, which has the device's numbers then.
+
+    The arrays are handed over one by one: `drjit.freeze` takes 50 µs to look into a dataclass.
+    """
     names = [field.name for field in fields(inputs)]  # type: ignore[arg-type]
     counts = [len(one.numbers) for one in what]
     numbers = [_handed(e, number) for one in what for number in one.numbers]

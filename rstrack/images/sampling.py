@@ -66,9 +66,9 @@ def depth_of(rho: Any) -> tuple[Any, Any]:
     return dr.rcp(dr.select(known, rho, 1.0)), known
 
 
-def pinhole_points(e: Engine, camera: Camera, rho: Any) -> tuple[Vector, Any]:
-    """Points that a rectified image's pixels see, by inverse depth `rho`, in its camera's frame; and which have any."""
-    _, x, y = grid(e, Raster.of(camera))
+def pinhole_points(e: Engine, camera: Camera, raster: Raster, rho: Any) -> tuple[Vector, Any]:
+    """Points that a rectified image's pixels see, by inverse depth `rho`, in its camera's frame; which have any."""
+    _, x, y = grid(e, raster)
     z, known = depth_of(rho)
     xn, yn = pinhole_ray(e, camera, x, y)
     return (xn * z, yn * z, z), known
@@ -86,7 +86,7 @@ def moved_to_base(e: Engine, lens: Lens, to_base: Any, x: Any, y: Any, p: Vector
     return move(gather(to_base, row_of_pixel(e, lens, x, y), TO_BASE, stride=TO_BASE), p)
 
 
-def bilinear(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
+def bilinear(e: Engine, image: Any, width: Any, height: Any, x: Any, y: Any, active: Any) -> tuple[Any, ...]:
     """Four neighbours (00, 10, 01, 11), the position between them, and whether all are inside."""
     active = active & (x >= 0.0) & (y >= 0.0) & (x < width - 1.0) & (y < height - 1.0)
     x0, y0 = dr.floor(x), dr.floor(y)
@@ -95,14 +95,14 @@ def bilinear(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, act
     return (*near, x - x0, y - y0, active)
 
 
-def bilinear_value(e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
+def bilinear_value(e: Engine, image: Any, width: Any, height: Any, x: Any, y: Any, active: Any) -> tuple[Any, Any]:
     """The bilinear value at (x, y), and whether all four neighbours are inside."""
     a, b, c, d, fx, fy, active = bilinear(e, image, width, height, x, y, active)
     return dr.lerp(dr.lerp(a, b, fx), dr.lerp(c, d, fx), fy), active
 
 
 def value_and_slope(
-    e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any
+    e: Engine, image: Any, width: Any, height: Any, x: Any, y: Any, active: Any
 ) -> tuple[Any, Any, Any, Any]:
     """The bilinear value at (x, y), its derivatives by x and y, and whether all four neighbours are inside."""
     a, b, c, d, fx, fy, active = bilinear(e, image, width, height, x, y, active)
@@ -111,7 +111,7 @@ def value_and_slope(
 
 
 def cubic_value_and_slope(
-    e: Engine, image: Any, width: int, height: int, x: Any, y: Any, active: Any
+    e: Engine, image: Any, width: Any, height: Any, x: Any, y: Any, active: Any
 ) -> tuple[Any, Any, Any, Any]:
     """`value_and_slope` by cubic convolution (Keys, IEEE Trans. ASSP 1981, a = −1/2), where all 16 pixels are inside.
 
@@ -143,7 +143,7 @@ def _keys(t: Any) -> tuple[list[Any], list[Any]]:
     return weights, slopes
 
 
-def nearest(e: Engine, width: int, x: Any, y: Any, active: Any) -> Any:
+def nearest(e: Engine, width: Any, x: Any, y: Any, active: Any) -> Any:
     """Index of the pixel nearest to (x, y); 0 where not active."""
     column, row = (e.UInt(e.Int(dr.select(active, v + 0.5, 0.0))) for v in (x, y))
     return row * width + column

@@ -22,14 +22,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rsgen import srgb
-from rsgen.device.arrays import Engine, Kernels, recorded, recorded_from
+from rsgen.device.arrays import Engine, Kernels, recorded_with
 from rsgen.device.lens import Lens
 from rsgen.device.projection import RollingProjection, cross, gather, move, project, project_rolling
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.line_poses import Exposure, from_base, line_twists, rows_of
 from rstrack.images.pyramid import DepthImage
-from rstrack.images.sampling import BEHIND, EDGE, bilinear, blur_weight, pinhole_points
+from rstrack.images.sampling import BEHIND, EDGE, Raster, bilinear, blur_weight, pinhole_points
 from rstrack.keyframes.keyframe import Reference
 
 SIGMA_PX = 1.0
@@ -115,7 +115,8 @@ class ColorFusion:
         T_old_new = se3.inverse(older_ref.T_world_base) @ ref.T_world_base
         pose = self.e.upload(rows_of(T_old_new))
         kernel = self._kernel(_inherit_kernel, older_ref.lens, ref.lens)
-        *rgb, weight = kernel(ref.inverse_depth, *older.rgb, older.weight, older_ref.inverse_depth, pose)
+        given = _InheritInput(ref.inverse_depth, *older.rgb, older.weight, older_ref.inverse_depth, pose)
+        *rgb, weight = kernel(given)
         camera = ref.lens.camera
         return FusedColor((rgb[0], rgb[1], rgb[2]), weight, (camera.height, camera.width))
 
@@ -138,7 +139,7 @@ def _hidden(e: Engine, lens: Lens, depth: Any, seen: RollingProjection, active: 
 
 
 def _cubic(
-    e: Engine, planes: Sequence[Any], stride: int, width: int, height: int, x: Any, y: Any, active: Any
+    e: Engine, planes: Sequence[Any], stride: int, width: Any, height: Any, x: Any, y: Any, active: Any
 ) -> list[Any]:
     """Light of three planes at positions inside the image, never below zero (Keys, IEEE TASSP 29(6), 1981, a = −1/2).
 
@@ -195,10 +196,10 @@ class _AddInput:
 def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable[[_AddInput], Any]:
     """Kernel → (r, g, b, weight): the keyframe's colour with one more image in it, weighted by equation (13)."""
 
-    @recorded_from(_AddInput)
-    def kernel(given: _AddInput) -> Any:
+    @recorded_with(e, _AddInput, lens, depth_lens, base, Raster.of(base.camera))
+    def kernel(given: _AddInput, lens: Lens, depth_lens: Lens, base: Lens, raster: Raster) -> Any:
         inv_sigma2, least, most = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(3))
-        p, active = pinhole_points(e, base.camera, given.inverse_depth)
+        p, active = pinhole_points(e, base.camera, raster, given.inverse_depth)
         seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         active &= seen.valid & ~_hidden(
             e, depth_lens, given.depth, project_rolling(depth_lens, given.depth_from_base, p, e.UInt, e.Int), active
@@ -220,24 +221,38 @@ def _add_kernel(e: Engine, lens: Lens, depth_lens: Lens, base: Lens) -> Callable
     return kernel
 
 
-def _inherit_kernel(e: Engine, older: Lens, base: Lens) -> Callable[..., Any]:
-    """Kernel (inverse_depth, older r, g, b, weight, inverse_depth, T_old_new) → (r, g, b, weight) in the new image.
+@dataclass(frozen=True)
+class _InheritInput:
+    """Device arrays: the keyframe's inverse depth; the older one's colour, weight and inverse depth; T_old_new."""
+
+    inverse_depth: Any
+    r: Any
+    g: Any
+    b: Any
+    weight: Any
+    older_inverse_depth: Any
+    T_old_new: Any
+
+
+def _inherit_kernel(e: Engine, older: Lens, base: Lens) -> Callable[[_InheritInput], Any]:
+    """Kernel → (r, g, b, weight) in the new image.
 
     Both images are global-shutter pinholes. Nothing is inherited across holes, or where depths disagree.
     """
-    width, height = older.camera.width, older.camera.height
 
-    @recorded
-    def kernel(rho: Any, r: Any, g: Any, b: Any, weight: Any, older_rho: Any, T_old_new: Any) -> Any:
-        p, active = pinhole_points(e, base.camera, rho)
-        at = project(older.camera, move(gather(T_old_new, e.UInt(0), 12, stride=12), p))
-        *near, _, _, active = bilinear(e, older_rho, width, height, at.x, at.y, active & at.valid)
+    @recorded_with(e, _InheritInput, older, base, Raster.of(base.camera))
+    def kernel(given: _InheritInput, older: Lens, base: Lens, raster: Raster) -> Any:
+        width, height, weight = older.camera.width, older.camera.height, given.weight
+        p, active = pinhole_points(e, base.camera, raster, given.inverse_depth)
+        at = project(older.camera, move(gather(given.T_old_new, e.UInt(0), 12, stride=12), p))
+        *near, _, _, active = bilinear(e, given.older_inverse_depth, width, height, at.x, at.y, active & at.valid)
         for value in near:
             active &= (value > 0.0) & (dr.abs(at.q[2] * value - 1.0) < EDGE)
         *near, _, _, active = bilinear(e, weight, width, height, at.x, at.y, active)
         least = dr.minimum(dr.minimum(near[0], near[1]), dr.minimum(near[2], near[3]))
         active &= least > 0.0
-        out = [dr.select(active, value, 0.0) for value in _cubic(e, (r, g, b), 1, width, height, at.x, at.y, active)]
+        planes = given.r, given.g, given.b
+        out = [dr.select(active, value, 0.0) for value in _cubic(e, planes, 1, width, height, at.x, at.y, active)]
         return *out, dr.select(active, least, 0.0)
 
     return kernel

@@ -16,7 +16,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.device.arrays import Engine, Kernels, recorded
+from rsgen.device.arrays import Engine, Kernels, recorded_with
 from rsgen.device.lens import Lens
 from rsgen.device.projection import project_rolling
 from rsgen.errors import UserError
@@ -28,7 +28,7 @@ from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import MARGIN, DeviceRig
 from rstrack.images.line_poses import IDENTITY_TO_BASE, Exposure, from_base_table, rows_of, to_base_table
 from rstrack.images.pyramid import depth_image
-from rstrack.images.sampling import bilinear_value, pinhole_points
+from rstrack.images.sampling import Raster, bilinear_value, pinhole_points
 from rstrack.keyframes.keyframe import rectified_lens
 from rstrack.keyframes.rectification import RectifyInput, rectify_kernel
 from rstrack.metrics.association import compare, truth_of
@@ -114,10 +114,11 @@ class FrameMapper:
         else:
             T = self._rig.T_color_depth @ se3.inverse(self._pose(exposure.mid_time)) @ T_estimate_base
             from_base = np.concatenate([rows_of(T), np.zeros(6)])
-        planes = [e.upload(plane / np.float32(255.0)) for plane in np.moveaxis(frame.colors[best].pixels, -1, 0)]
-        out: list[Any] = self._kernel(_lookup_kernel, self._device.color_lens, self.base)(
-            rho, *planes, e.upload(from_base)
+        red, green, blue = (
+            e.upload(plane / np.float32(255.0)) for plane in np.moveaxis(frame.colors[best].pixels, -1, 0)
         )
+        look_up = self._kernel(_lookup_kernel, self._device.color_lens, self.base)
+        out: list[Any] = look_up(_LookupInput(rho, red, green, blue, e.upload(from_base)))
         return out
 
     def _pose(self, t: float) -> FloatArray:
@@ -136,21 +137,31 @@ class FrameMapper:
         return bool((np.abs(around - times[0]) <= _POSE_WITHIN_S).all())
 
 
-def _lookup_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[..., Any]:
-    """Kernel (inverse_depth, red, green, blue, from_base) → [red, green, blue, 1 where seen], equation (3).
+@dataclass(frozen=True)
+class _LookupInput:
+    """Device arrays: inverse depth, the colour image's planes, and the poses of its lines."""
+
+    inverse_depth: Any
+    red: Any
+    green: Any
+    blue: Any
+    from_base: Any
+
+
+def _lookup_kernel(e: Engine, lens: Lens, base: Lens) -> Callable[[_LookupInput], Any]:
+    """Kernel → [red, green, blue, 1 where seen], equation (3).
 
     Colours of a rectified depth image's points (`base`, a global-shutter pinhole) in a colour image of `lens`.
     """
-    camera = lens.camera
 
-    @recorded
-    def kernel(rho: Any, red: Any, green: Any, blue: Any, from_base: Any) -> Any:
-        p, active = pinhole_points(e, base.camera, rho)
-        seen = project_rolling(lens, from_base, p, e.UInt, e.Int)
+    @recorded_with(e, _LookupInput, lens, base, Raster.of(base.camera))
+    def kernel(given: _LookupInput, lens: Lens, base: Lens, raster: Raster) -> Any:
+        p, active = pinhole_points(e, base.camera, raster, given.inverse_depth)
+        seen = project_rolling(lens, given.from_base, p, e.UInt, e.Int)
         out = []
-        inside = active & seen.valid
-        for plane in (red, green, blue):
-            value, inside = bilinear_value(e, plane, camera.width, camera.height, seen.x, seen.y, inside)
+        inside, size = active & seen.valid, (lens.camera.width, lens.camera.height)
+        for plane in (given.red, given.green, given.blue):
+            value, inside = bilinear_value(e, plane, *size, seen.x, seen.y, inside)
             out.append(value)
         return [*(dr.select(inside, value, 0.0) for value in out), dr.select(inside, e.Float(1.0), 0.0)]
 
