@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned
 from rsgen.render.irradiance import FREE, REACH_LEVELS, Lattice, packed_reach
-from rsgen.render.rays import RAY_OFFSET_M, rays_from
+from rsgen.scene.rays import RAY_OFFSET_M, rays_from
 
 _HEIGHT_M = 1e-3  # of the rays above the surface
 _SHORTEST_M = 2e-4  # neighbours nearer than this are taken for joined

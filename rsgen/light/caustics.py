@@ -24,7 +24,7 @@ from rsgen.light.sampling import CHANNELS, about_normal, in_channels, rotation, 
 from rsgen.light.specular_paths import SPECULAR, casts_caustics, caustic_radiance, transmitted
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import at_triangles, registry_id
-from rsgen.render.meshes import mesh_arrays
+from rsgen.scene.meshes import mesh_arrays
 
 # Where photons land, the normals of the sides they land on, (n, 3) each, and what each brings, W: (n, CHANNELS).
 Photons = tuple[NDArray, NDArray, NDArray]

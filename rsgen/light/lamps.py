@@ -35,7 +35,7 @@ from rsgen.light.sampling import (
 from rsgen.light.specular_paths import first_scatterer, transmitted
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import registry_id
-from rsgen.render.rays import RAY_OFFSET_M
+from rsgen.scene.rays import RAY_OFFSET_M
 
 MANY_EMITTERS = 24  # more are sampled together, as one
 _ROUNDS = 6  # the last one ends at twice as many samples as are asked for

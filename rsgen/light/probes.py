@@ -18,7 +18,7 @@ from rsgen.device.arrays import aligned
 from rsgen.light.sampling import r2
 from rsgen.light.specular_paths import first_scatterer, passes_light_on, transmitted
 from rsgen.render.irradiance import IrradianceField
-from rsgen.render.moving_objects import HARMONICS, harmonics, irradiance_coefficients
+from rsgen.scene.moving_objects import HARMONICS, harmonics, irradiance_coefficients
 
 _RAYS = 4096
 _LAMP_SAMPLES = 4096  # over all lamps together

@@ -26,7 +26,7 @@ from rsgen.light.sky import LESS, has_sky_light, sky_light
 from rsgen.light.specular_paths import first_scatterer, passes_light_on, shines
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import IrradianceField
-from rsgen.render.rays import rays_from
+from rsgen.scene.rays import rays_from
 
 _GREY = 0.18  # reflectance of the surface that is looked at, where light is typical
 # Samples of each lamp, the sky and surfaces: their scatter must not hide the errors that are looked for.

@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from rsgen.render.rays import proper
+from rsgen.scene.rays import proper
 
 # Panes and mirrors that a ray is followed through: a double-glazed window seen in a mirror has nine.
 _MOST = 10

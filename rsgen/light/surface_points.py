@@ -17,8 +17,8 @@ from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import rows_of, vectors
 from rsgen.light.barriers import find_barriers, find_covered
 from rsgen.render.irradiance import Lattice, at_triangles, lattice_barycentric, registry_id
-from rsgen.render.meshes import mesh_arrays
-from rsgen.render.rays import RAY_OFFSET_M
+from rsgen.scene.meshes import mesh_arrays
+from rsgen.scene.rays import RAY_OFFSET_M
 
 _NORMAL_SCALE = 0.35  # normals this far apart count as much as one spacing
 _APART = 1e4  # spacings between different pieces of surface

@@ -134,7 +134,7 @@ def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
 
 def scene_triangles(scene: Any) -> FloatArray:
     """Corners (m, 3, 3) of all triangles of a Mitsuba scene, world frame, metres."""
-    from rsgen.render.meshes import surface
+    from rsgen.scene.meshes import surface
 
     vertices, faces = surface(scene)
     return np.asarray(vertices, float)[faces]
@@ -142,7 +142,7 @@ def scene_triangles(scene: Any) -> FloatArray:
 
 def write_scene_ply(scene: Any, path: Path) -> None:
     """All triangles of the scene, world frame, metres, as binary PLY. Raises UserError if it cannot be written."""
-    from rsgen.render.meshes import surface
+    from rsgen.scene.meshes import surface
 
     vertices, faces = surface(scene)
     write_ply(vertices, faces, path)
@@ -150,7 +150,7 @@ def write_scene_ply(scene: Any, path: Path) -> None:
 
 def write_ply(vertices: Any, faces: Any, path: Path) -> None:
     """Triangles as binary PLY. Raises UserError if it cannot be written."""
-    from rsgen.render.meshes import ply_bytes
+    from rsgen.scene.meshes import ply_bytes
 
     atomic_write(path, ply_bytes(vertices, faces))
 

@@ -1,7 +1,7 @@
 """The scenes that ship: found by looking into the folder scenes, each with the script that builds it.
 
 A script is one that defines a function `build`: scenes/X/build.py builds scenes/X/scene.xml and is called X, another
-scenes/X/y.py builds scenes/X/y.xml and is called y (`render.scene.ensure_built` builds by the same rule). It is read,
+scenes/X/y.py builds scenes/X/y.xml and is called y (`scene.loading.ensure_built` builds by the same rule). It is read,
 not run: what it is comes from its constant ABOUT, or else from its docstring, and it takes seeds where `build` has a
 parameter of that name.
 """
@@ -289,7 +289,7 @@ def _lit(scene: ShippedScene) -> tuple[int, int]:
 
     mitsuba()
     from rsgen.light.cache import cache_folder, cache_key
-    from rsgen.render.scene import content_hash
+    from rsgen.scene.loading import content_hash
 
     lights = [load_config(file).light for file in scene.configs] or [LightConfig()]
     state = content_hash(scene.file)
@@ -301,9 +301,9 @@ def _lit(scene: ShippedScene) -> tuple[int, int]:
 def _largest_floor(file: Path) -> tuple[float, float | None] | None:
     """`Description.floor` of a built scene: of floors with a ceiling, as `motion suggest` finds them, else of all."""
     from rsgen.motion.floor_plan import find_floors
-    from rsgen.render.meshes import surface
-    from rsgen.render.rays import cast_rays
-    from rsgen.render.scene import load_scene
+    from rsgen.scene.loading import load_scene
+    from rsgen.scene.meshes import surface
+    from rsgen.scene.rays import cast_rays
 
     loaded = load_scene(file)
     corners = surface(loaded)[0].astype(np.float64)

@@ -150,12 +150,12 @@ def load_scene(config: Config) -> Any:
     from rsgen.device.backend import mitsuba
 
     mitsuba(config.backend)
-    from rsgen.render import scene
-    from rsgen.render.board import Board
+    from rsgen.scene import loading
+    from rsgen.scene.board import Board
 
     target = config.target
     board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))
-    return scene.load_scene(config.scene.file, board, _options(config.scene))
+    return loading.load_scene(config.scene.file, board, _options(config.scene))
 
 
 def scene_hash(config: Config) -> str:
@@ -163,13 +163,13 @@ def scene_hash(config: Config) -> str:
     from rsgen.device.backend import mitsuba
 
     mitsuba(config.backend)
-    from rsgen.render.scene import content_hash
+    from rsgen.scene.loading import content_hash
 
     return content_hash(config.scene.file, _options(config.scene))
 
 
 def _options(scene: SceneConfig) -> Any:
-    from rsgen.render.placement import SceneOptions
+    from rsgen.scene.placement import SceneOptions
 
     return SceneOptions(scene.scale, scene.up, scene.light, scene.skip_missing)
 
@@ -182,7 +182,7 @@ def surfaces_hash(config: Config) -> str:
 
 def load_meshes(objects: Sequence[ObjectConfig]) -> tuple[Any, ...]:
     """An `ObjectMesh` of each object. Raises UserError."""
-    from rsgen.render.object_meshes import load_object
+    from rsgen.scene.object_meshes import load_object
 
     return tuple(load_object(thing) for thing in objects)
 
@@ -194,7 +194,7 @@ def mesh_hashes(objects: Sequence[ObjectConfig], backend: Backend) -> dict[str, 
     from rsgen.device.backend import mitsuba
 
     mitsuba(backend)
-    from rsgen.render.object_meshes import object_hash
+    from rsgen.scene.object_meshes import object_hash
 
     return {f"object {thing.name}": object_hash(thing) for thing in objects}
 
@@ -303,7 +303,7 @@ def mirrored_samples(light: LightConfig, spp: int) -> int:
 def _lit_objects(scene: Any, field: Any, meshes: Sequence[Any], splines: Sequence[Spline]) -> Any:
     """`MovingObjects` of meshes along splines in a scene whose baked irradiance is `field`."""
     from rsgen.light.probes import gathered_light
-    from rsgen.render.moving_objects import MovingObject, MovingObjects, ObjectLight
+    from rsgen.scene.moving_objects import MovingObject, MovingObjects, ObjectLight
 
     things = []
     for mesh, spline in zip(meshes, splines, strict=True):

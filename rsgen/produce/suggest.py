@@ -139,10 +139,10 @@ def suggest_tour(
     camera, no floor, or no scene, and if it is a room in another unit than metres.
     """
     mitsuba()
-    from rsgen.render.meshes import coarser, inhabited_box
-    from rsgen.render.placement import AS_IT_IS, SceneOptions, camera_up
-    from rsgen.render.rays import cast_rays
-    from rsgen.render.scene import load_scene
+    from rsgen.scene.loading import load_scene
+    from rsgen.scene.meshes import coarser, inhabited_box
+    from rsgen.scene.placement import AS_IT_IS, SceneOptions, camera_up
+    from rsgen.scene.rays import cast_rays
 
     options = SceneOptions(scale, up, skip_missing=skip_missing)
     placed = {k: v for k, v in vars(options).items() if v != getattr(AS_IT_IS, k)}

@@ -255,7 +255,7 @@ def path_traced(scene: Any) -> Shine:
     import mitsuba as mi
 
     from rsgen.light.lamps import straight_through_bulbs
-    from rsgen.render.rays import radiance_along
+    from rsgen.scene.rays import radiance_along
 
     integrator = mi.load_dict({"type": "path", "max_depth": _DEPTH})
 

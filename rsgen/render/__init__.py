@@ -1,1 +1,1 @@
-"""Rendering with Mitsuba 3: scene, rolling-shutter sensor, images, baked light."""
+"""Rendering with Mitsuba 3: rolling-shutter sensor, samples of pixels, images, baked light."""

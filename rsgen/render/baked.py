@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from rsgen.render.irradiance import IrradianceField
-from rsgen.render.moving_objects import MovingObjects, ShadedField
-from rsgen.render.rays import proper
+from rsgen.scene.moving_objects import MovingObjects, ShadedField
+from rsgen.scene.rays import proper
 
 _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmission)
 _SPECULAR = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)

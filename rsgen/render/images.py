@@ -19,9 +19,9 @@ from rsgen.device.pose_table import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.pixel_samples import PixelSamples
 from rsgen.render.sensor import RollingShutterSensor
+from rsgen.scene.moving_objects import MovingObjects
 
 # Samples in one launch; more are rendered in several and averaged, which bounds memory.
 _LAUNCH = 1 << 24

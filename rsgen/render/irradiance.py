@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned, vectors
 from rsgen.errors import UserError
-from rsgen.render.meshes import coarser, inhabited_box, mesh_arrays
+from rsgen.scene.meshes import coarser, inhabited_box, mesh_arrays
 
 REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of the way
 FREE = REACH_LEVELS  # and this, beyond the neighbour: nothing stands between

@@ -14,8 +14,8 @@ import numpy as np
 from rsgen.array_types import BoolArray, Float32Array
 from rsgen.device.arrays import aligned
 from rsgen.device.pose_table import PoseFunction
-from rsgen.render.moving_objects import MovingObjects
 from rsgen.render.sensor import RollingShutterSensor
+from rsgen.scene.moving_objects import MovingObjects
 
 # Shadow rays end this much short of the surface, as a fraction of their length: 0.1 mm at 1 m. Depth is exact to 1e-6.
 _SHORT = 1e-4

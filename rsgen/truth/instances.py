@@ -22,8 +22,8 @@ from rsgen.device.arrays import aligned
 from rsgen.errors import UserError
 from rsgen.files import read_text
 from rsgen.formats import scene_reader
-from rsgen.render.meshes import mesh_arrays
-from rsgen.render.placement import SceneOptions
+from rsgen.scene.meshes import mesh_arrays
+from rsgen.scene.placement import SceneOptions
 
 PARTS = "parts*.csv"
 """Beside a scene: lines 'shape,first,name': from its triangle `first` on, a shape is of the thing `name`."""

@@ -40,8 +40,8 @@ from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
-from rsgen.render.moving_objects import MovingObjects, ObjectsInFrame
 from rsgen.render.sensor import RollingShutterSensor
+from rsgen.scene.moving_objects import MovingObjects, ObjectsInFrame
 from rsgen.sensors.color import to_srgb8
 from rsgen.sequence.format import LABELS_IMAGE, OBJECT_IDS
 from rsgen.truth.instances import Instances

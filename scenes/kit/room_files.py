@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 import cv2
 import numpy as np
 
-from rsgen.render.meshes import ply_bytes
+from rsgen.scene.meshes import ply_bytes
 from scenes.kit.materials import Material, texture
 from scenes.kit.pieces import Piece, parts_rows
 from scenes.kit.shapes import Mesh, merge

@@ -27,7 +27,7 @@ from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 from rstrack.bench.cells import load_benchmark
 from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import run_cells

@@ -18,7 +18,7 @@ import hostile
 import recordings
 
 from rsgen.device.backend import mitsuba
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 from rsgen.sequence.reader import read_sequence
 from rstrack.data.dataset import open_dataset
 from rstrack.formats import open_recording

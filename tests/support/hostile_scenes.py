@@ -10,7 +10,7 @@ import tiny
 import trimesh
 from hostile_cases import Base, Case, linked, of_8_gb, piped, replaced_by
 
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 
 
 def scenes(folder: Path) -> Iterator[Case]:

@@ -12,8 +12,8 @@ from rsgen.config.config import LightConfig
 from rsgen.device.arrays import rows_of
 from rsgen.light import cache as lighting
 from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
-from rsgen.render.rays import rays_from
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
+from rsgen.scene.rays import rays_from
 
 UP = np.array([0.0, 0.0, 1.0])
 FLOOR = """<shape type="rectangle" id="floor">

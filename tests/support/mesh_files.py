@@ -23,7 +23,7 @@ from rsgen.light.bake import bake
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
 from rsgen.render.irradiance import make_field, make_lattice
-from rsgen.render.placement import SceneOptions
+from rsgen.scene.placement import SceneOptions
 
 WIDTH, HEIGHT, FOCAL = 80, 60, 70.0
 CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5)

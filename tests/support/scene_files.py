@@ -11,7 +11,7 @@ import pytest
 from rendering import mi
 
 from rsgen.errors import UserError
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 
 _RIGID = '<rotate x="0.36" y="0.48" z="-0.8" angle="50"/><translate x="0.3" y="-0.2" z="0.4"/>'
 ANY_POSE = '<scale x="0.8" y="1.3" z="0.6"/>' + _RIGID

@@ -12,8 +12,8 @@ import pytest
 from rendering import mi
 
 from rsgen.formats.scenes.import_scene import import_scene
-from rsgen.render.meshes import surface
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
+from rsgen.scene.meshes import surface
 
 needs_usd = pytest.mark.skipif(find_spec("pxr") is None, reason="needs USD: pip install usd-core")
 SQUARE = """

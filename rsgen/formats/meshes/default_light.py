@@ -18,7 +18,7 @@ from rsgen.config.sections import SceneLight
 from rsgen.device.arrays import aligned
 from rsgen.errors import UserError
 from rsgen.formats.meshes.parts import Part
-from rsgen.render.meshes import joined_triangles, ply_bytes
+from rsgen.scene.meshes import joined_triangles, ply_bytes
 
 SKY = 0.8  # radiance
 _IRRADIANCE = 2.5  # of lamps on a floor, were all their light to reach it: about what the sky gives in the open
@@ -82,7 +82,7 @@ class Probe:
 
     def _cast(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Distance (n,) to what rays (n, 3) meet, inf for nothing, and whether they meet it from in front."""
-        from rsgen.render.rays import cast_rays
+        from rsgen.scene.rays import cast_rays
 
         distance, normal = cast_rays(self._scene, origins, directions)
         return distance, np.isfinite(distance) & (np.einsum("ij,ij->i", normal, directions) < 0)

@@ -26,10 +26,10 @@ from rsgen.formats.meshes.default_light import light_shapes
 from rsgen.formats.meshes.parts import Part, finished, placed
 from rsgen.image_codecs import encode_png
 from rsgen.inputs import check_input
-from rsgen.render.material import Material, Texture, bsdf, emitter
-from rsgen.render.meshes import ply_bytes
-from rsgen.render.placement import SceneOptions, world_from_file
-from rsgen.render.xml_scene import located, missing_file
+from rsgen.scene.material import Material, Texture, bsdf, emitter
+from rsgen.scene.meshes import ply_bytes
+from rsgen.scene.placement import SceneOptions, world_from_file
+from rsgen.scene.xml_scene import located, missing_file
 
 log = logging.getLogger("rsgen")
 

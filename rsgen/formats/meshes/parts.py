@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.limits import MOST_M
-from rsgen.render.material import Material
-from rsgen.render.meshes import has_area
+from rsgen.scene.material import Material
+from rsgen.scene.meshes import has_area
 
 log = logging.getLogger("rsgen")
 

@@ -21,7 +21,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import first_few
 from rsgen.formats.meshes.mesh_file import from_srgb, given_normals
 from rsgen.formats.polygons import is_convex, triangulated
-from rsgen.render.meshes import joined_triangles, ply_bytes
+from rsgen.scene.meshes import joined_triangles, ply_bytes
 
 _OBJ_METHOD = b"obj-polygons/2"
 """Raise when files come out differently: light baked on their surfaces is stored under it."""

@@ -22,7 +22,7 @@ from rsgen.errors import UserError
 from rsgen.formats.mitsuba_xml import Changes
 from rsgen.formats.mitsuba_xml.colors import FACTOR, numbers
 from rsgen.formats.mitsuba_xml.plugins import Exists, Upgrade
-from rsgen.render.xml_scene import located
+from rsgen.scene.xml_scene import located
 
 METHOD = b"old-xml/2"
 """Raise when old files come out differently: their baked light is stored under it."""

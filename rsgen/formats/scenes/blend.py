@@ -18,7 +18,7 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes.mesh_file import read_parts
 from rsgen.formats.scenes.content import Content, Lamp, check_installed
-from rsgen.render.placement import SceneOptions, world_from_file
+from rsgen.scene.placement import SceneOptions, world_from_file
 
 _LONGEST_S = 1800
 # Blender's z is up, in GLB y is: (x, y, z) becomes (x, z, -y).

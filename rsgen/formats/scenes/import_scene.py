@@ -26,7 +26,7 @@ from rsgen.formats.meshes.parts import finished
 from rsgen.formats.scenes.content import Content, lamp_shapes
 from rsgen.image_codecs import encode_exr, encode_png
 from rsgen.inputs import check_input
-from rsgen.render.placement import SceneOptions
+from rsgen.scene.placement import SceneOptions
 
 
 @dataclass(frozen=True)

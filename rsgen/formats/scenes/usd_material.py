@@ -18,7 +18,7 @@ from rsgen.formats.scenes.usd_texture import (
     transform_of,
     wrap_of,
 )  # fmt: skip
-from rsgen.render.material import Material, Texture
+from rsgen.scene.material import Material, Texture
 
 COORDINATES = "st"
 COLORS = "displayColor"

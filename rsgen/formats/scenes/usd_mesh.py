@@ -14,7 +14,7 @@ from rsgen.formats.meshes.parts import Part
 from rsgen.formats.polygons import triangulate
 from rsgen.formats.scenes.content import Notes
 from rsgen.formats.scenes.usd_material import BoundMaterial
-from rsgen.render.material import Material
+from rsgen.scene.material import Material
 
 SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane")
 

@@ -19,7 +19,7 @@ from rsgen.formats.scenes.content import MOST_TRIANGLES, Content, Lamp, Notes, c
 from rsgen.formats.scenes.usd_material import UNBOUND, Materials
 from rsgen.formats.scenes.usd_mesh import SOLIDS, Primvar, mesh_triangles, parts, smooth_normals, solid
 from rsgen.inputs import check_input
-from rsgen.render.placement import SceneOptions, world_from_file
+from rsgen.scene.placement import SceneOptions, world_from_file
 
 _HIDDEN = ("proxy", "guide")
 _DEEPEST = 200  # prims within prims: beyond, instancers hold themselves

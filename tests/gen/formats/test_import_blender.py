@@ -15,7 +15,7 @@ from usd_scenes import brightness, imported
 from rsgen.errors import UserError
 from rsgen.formats.scenes import blend
 from rsgen.formats.scenes.import_scene import import_scene
-from rsgen.render.meshes import surface
+from rsgen.scene.meshes import surface
 
 needs_blender = pytest.mark.skipif(find_spec("bpy") is None, reason="needs Blender: pip install 'bpy==4.2.*'")
 

@@ -22,9 +22,9 @@ from rsgen.formats.meshes.parts import Part
 from rsgen.formats.polygons import triangulate
 from rsgen.formats.scenes import content
 from rsgen.formats.scenes.import_scene import write_folder, write_scene
-from rsgen.render.material import Material, Texture, bsdf
-from rsgen.render.placement import SceneOptions
-from rsgen.render.scene import content_hash, load_scene
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.material import Material, Texture, bsdf
+from rsgen.scene.placement import SceneOptions
 
 
 def test_polygons_of_a_mesh_keep_their_area_and_order_and_holes_are_left_out() -> None:

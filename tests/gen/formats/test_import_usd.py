@@ -24,7 +24,7 @@ from usd_scenes import (
 
 from rsgen.errors import UserError
 from rsgen.formats.scenes.import_scene import import_scene
-from rsgen.render.meshes import surface
+from rsgen.scene.meshes import surface
 
 # --- where things are
 

@@ -20,9 +20,9 @@ from rendering import mi
 from rsgen.config.config import load_config
 from rsgen.errors import UserError
 from rsgen.formats.meshes.default_light import Probe
-from rsgen.render.meshes import mesh_arrays, surface
-from rsgen.render.placement import SceneOptions
-from rsgen.render.scene import content_hash, load_scene
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.meshes import mesh_arrays, surface
+from rsgen.scene.placement import SceneOptions
 
 # --- where things are
 

@@ -36,8 +36,8 @@ from trimesh.visual.material import PBRMaterial
 from rsgen import srgb
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import DepthRenderer
-from rsgen.render.meshes import surface
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
+from rsgen.scene.meshes import surface
 
 # --- images
 

@@ -11,7 +11,7 @@ import pytest
 from rendering import dr, mi
 
 from rsgen import srgb
-from rsgen.render.scene import content_hash, load_scene
+from rsgen.scene.loading import content_hash, load_scene
 
 IMAGE = np.random.default_rng(1).integers(0, 255, (4, 4, 3)).astype(np.uint8)
 COLOR = srgb.decode(IMAGE.astype(float) / 255)

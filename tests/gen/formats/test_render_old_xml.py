@@ -19,8 +19,8 @@ from rsgen.formats.mitsuba_xml.upgrade import upgrade
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
-from rsgen.render.scene import content_hash, load_scene
-from rsgen.render.xml_scene import older_version, plugin_finder
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.xml_scene import older_version, plugin_finder
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 

@@ -15,8 +15,8 @@ from trimesh.transformations import random_rotation_matrix
 
 from rsgen.formats.mitsuba_xml.mesh_files import with_triangles
 from rsgen.formats.polygons import is_convex, triangulated
-from rsgen.render.meshes import surface
-from rsgen.render.scene import content_hash, load_scene
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.meshes import surface
 
 
 def twice_area(corners: np.ndarray, triangles: np.ndarray) -> np.ndarray:

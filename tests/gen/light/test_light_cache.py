@@ -21,7 +21,7 @@ from rsgen.config.config import LightConfig
 from rsgen.errors import UserError
 from rsgen.light import cache as lighting
 from rsgen.render.irradiance import IrradianceField, make_lattice
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 
 
 def test_a_bake_is_deterministic(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from rsgen.light.interpolation import Interpolation, thin
 from rsgen.light.quality import estimated_quality
 from rsgen.light.surface_points import SamplePoints, sample_points
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
-from rsgen.render.meshes import surface
+from rsgen.scene.meshes import surface
 
 
 @pytest.fixture(scope="module")

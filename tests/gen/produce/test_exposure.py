@@ -24,7 +24,7 @@ from rsgen.produce.views import (
     suggested_exposure,
     views_along,
 )
-from rsgen.render.rays import cast_rays
+from rsgen.scene.rays import cast_rays
 
 CAMERA = Camera(640, 480, 480.0, 480.0, 319.5, 239.5)
 GLOWING = """<shape type="cube"><transform name="to_world"><scale value="2"/></transform>

@@ -105,7 +105,7 @@ def test_light_that_is_baked_is_told(cell: Path) -> None:
 
     mitsuba()
     from rsgen.light.cache import cache_folder, cache_key
-    from rsgen.render.scene import content_hash
+    from rsgen.scene.loading import content_hash
 
     file = library.build_variant("cell", None, cell)
     folder = cache_folder(file)

@@ -26,8 +26,8 @@ from rsgen.produce.parts import TrueMotion, load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour
 from rsgen.produce.tour import doubt, likely_unit, view_times
 from rsgen.produce.views import path_traced, score, views_along
-from rsgen.render.rays import cast_rays
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
+from rsgen.scene.rays import cast_rays
 
 CLEARANCE_M = 0.2
 

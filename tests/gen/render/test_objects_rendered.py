@@ -22,8 +22,8 @@ from rsgen.image_codecs import encode_exr, read_exr
 from rsgen.light.probes import gathered_light
 from rsgen.produce.parts import load_motion, open_frames
 from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
-from rsgen.render.moving_objects import MovingObject, ObjectsInFrame, covered, harmonics, irradiance_coefficients
-from rsgen.render.object_meshes import load_object
+from rsgen.scene.moving_objects import MovingObject, ObjectsInFrame, covered, harmonics, irradiance_coefficients
+from rsgen.scene.object_meshes import load_object
 from rsgen.sequence.reader import read_sequence
 
 # --- light

@@ -24,7 +24,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.produce import parts
 from rsgen.render import images as render
 from rsgen.render.images import ColorRenderer, DepthRenderer
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 from rsgen.sensors.color import to_srgb8
 
 

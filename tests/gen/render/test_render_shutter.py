@@ -16,8 +16,8 @@ from room_frames import MOTION, STAMP, color, z_spread
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import DepthRenderer, global_shutter
-from rsgen.render.meshes import ply_bytes
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
+from rsgen.scene.meshes import ply_bytes
 
 
 @pytest.fixture(scope="module")

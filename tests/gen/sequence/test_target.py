@@ -20,8 +20,8 @@ from rsgen.errors import UserError
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.produce.parts import load_scene, scene_hash, surfaces_hash
-from rsgen.render.board import Board, drawing, surface
-from rsgen.render.meshes import mesh_arrays
+from rsgen.scene.board import Board, drawing, surface
+from rsgen.scene.meshes import mesh_arrays
 from rsgen.sequence.images import Sequence
 from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.truth_files import TARGET_CORNERS

@@ -15,7 +15,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import ColorRenderer
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 from rsgen.sensors.color import to_srgb8
 from rsgen.truth.renderer import TruthRenderer
 

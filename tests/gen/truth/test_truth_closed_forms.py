@@ -12,7 +12,7 @@ from truth_frames import GEOMETRY, STAMP, render
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.render.meshes import ply_bytes
+from rsgen.scene.meshes import ply_bytes
 from rsgen.truth.renderer import global_instant
 
 

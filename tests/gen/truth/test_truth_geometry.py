@@ -20,7 +20,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.render.images import DepthRenderer
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
 from rsgen.truth.renderer import global_instant
 
 

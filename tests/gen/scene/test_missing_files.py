@@ -12,8 +12,8 @@ import trimesh
 from rsgen.config.config import Config, validate_config
 from rsgen.errors import UserError
 from rsgen.image_codecs import encode_png
-from rsgen.render.placement import SceneOptions
-from rsgen.render.scene import content_hash, load_scene
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.placement import SceneOptions
 
 SKIP = SceneOptions(skip_missing=True)
 XML = """<scene version="{version}">

@@ -26,7 +26,7 @@ from rsgen.device.pose_table import PoseTable
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
-from rsgen.render.object_meshes import ObjectMesh
+from rsgen.scene.object_meshes import ObjectMesh
 
 Rows = list[Any]  # of [R t]
 

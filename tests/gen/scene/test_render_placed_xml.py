@@ -14,12 +14,12 @@ from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.image_codecs import encode_exr
-from rsgen.render import placement
-from rsgen.render.board import Board
 from rsgen.render.images import ColorRenderer, DepthRenderer
-from rsgen.render.meshes import mesh_arrays
-from rsgen.render.placement import SceneOptions, camera_up
-from rsgen.render.scene import content_hash, load_scene
+from rsgen.scene import placement
+from rsgen.scene.board import Board
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.meshes import mesh_arrays
+from rsgen.scene.placement import SceneOptions, camera_up
 
 CAMERA = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
 OPTIONS = SceneOptions(scale=0.01, up="z")

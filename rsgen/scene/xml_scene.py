@@ -21,7 +21,7 @@ import numpy as np
 from rsgen.errors import UserError, first_few
 from rsgen.formats import xml_helper
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
-from rsgen.render.xml_shapes import children, flatten
+from rsgen.scene.xml_shapes import children, flatten
 
 log = logging.getLogger("rsgen")
 

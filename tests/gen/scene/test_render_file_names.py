@@ -11,9 +11,9 @@ import trimesh
 from rendering import mi
 from scene_files import fails
 
-from rsgen.render.meshes import surface
-from rsgen.render.scene import content_hash, load_scene
-from rsgen.render.xml_scene import located
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.meshes import surface
+from rsgen.scene.xml_scene import located
 
 NAMED = """<scene version="{}"><shape type="ply"><string name="filename" value="MESHES\\Box.PLY"/><bsdf type="diffuse">
     <texture type="bitmap" name="reflectance"><string name="filename" value="textures/darkOAK.PNG"/></texture></bsdf>

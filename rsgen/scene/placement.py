@@ -16,7 +16,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.config.sections import SceneLight, Up
 from rsgen.errors import UserError
-from rsgen.render.xml_shapes import pose_of
+from rsgen.scene.xml_shapes import pose_of
 
 # Rotations that bring an axis of the file up, the world's y.
 _UP = {

@@ -17,9 +17,9 @@ from rsgen.config.sections import TruthConfig
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import DepthRenderer
-from rsgen.render.moving_objects import MovingObject, MovingObjects
-from rsgen.render.object_meshes import load_object
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
+from rsgen.scene.moving_objects import MovingObject, MovingObjects
+from rsgen.scene.object_meshes import load_object
 from rsgen.truth.renderer import TruthRenderer, global_instant
 
 STAMP, NEXT = 0.31, 0.31 + 1 / 30

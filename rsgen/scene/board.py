@@ -16,7 +16,7 @@ from rsgen.array_types import ByteArray, FloatArray, IntArray
 from rsgen.geometry import se3
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.image_codecs import encode_png
-from rsgen.render.meshes import ply_bytes
+from rsgen.scene.meshes import ply_bytes
 
 BOARD_ID = "rsgen_target"  # of its shape in a scene
 _TAG_PX = 100  # ten cells of a tag; a hundredth of a tag is one pixel

@@ -15,8 +15,8 @@ from scene_files import ANY_POSE, EVEN_POSE, MIRRORED, SHAPES, fails, hits, rays
 
 from rsgen.errors import UserError
 from rsgen.image_codecs import encode_exr
-from rsgen.render.meshes import mesh_arrays, surface
-from rsgen.render.scene import content_hash, ensure_built, load_scene
+from rsgen.scene.loading import content_hash, ensure_built, load_scene
+from rsgen.scene.meshes import mesh_arrays, surface
 
 # What 96 segments around leave between chord and circle: radius · (1 − cos(π / 96)).
 SAGITTA = 1 - np.cos(np.pi / 96)
@@ -254,7 +254,7 @@ def test_one_thread_is_enough_to_read_an_exr(tmp_path: Path) -> None:
     )
     code = (
         "from rsgen.device.backend import select\nselect()\nimport sys, drjit, pathlib\ndrjit.set_thread_count(1)\n"
-        "from rsgen.render.scene import load_scene\nload_scene(pathlib.Path(sys.argv[1]))\n"
+        "from rsgen.scene.loading import load_scene\nload_scene(pathlib.Path(sys.argv[1]))\n"
         "assert drjit.thread_count() == 1"
     )
     words = [sys.executable, "-c", code, str(tmp_path / "scene.xml")]

@@ -21,9 +21,9 @@ from rsgen.light.bake import bake
 from rsgen.produce.parts import make_integrator
 from rsgen.render import irradiance
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
-from rsgen.render.meshes import ply_bytes, surface
-from rsgen.render.scene import load_scene
-from rsgen.render.xml_scene import messages_to_log
+from rsgen.scene.loading import load_scene
+from rsgen.scene.meshes import ply_bytes, surface
+from rsgen.scene.xml_scene import messages_to_log
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from nightly import sampled
 from rendering import mi
 from scene_files import EVEN_POSE, MIRRORED, hits, rays_at, write_scene
 
-from rsgen.render.meshes import mesh_arrays, surface
-from rsgen.render.scene import load_scene
+from rsgen.scene.loading import load_scene
+from rsgen.scene.meshes import mesh_arrays, surface
 
 
 def instanced(group: str, *poses: str) -> list[str]:

@@ -23,10 +23,10 @@ from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.formats import scene_reader, xml_helper
 from rsgen.inputs import check_input
-from rsgen.render.board import BOARD_ID, Board, board_xml
-from rsgen.render.meshes import repair_meshes, split_terrain
-from rsgen.render.placement import AS_IT_IS, SceneOptions, place, place_lamps
-from rsgen.render.xml_scene import (
+from rsgen.scene.board import BOARD_ID, Board, board_xml
+from rsgen.scene.meshes import repair_meshes, split_terrain
+from rsgen.scene.placement import AS_IT_IS, SceneOptions, place, place_lamps
+from rsgen.scene.xml_scene import (
     Parsed,
     check_files,
     explained,
@@ -37,7 +37,7 @@ from rsgen.render.xml_scene import (
     prepare,
     unknown_properties,
 )
-from rsgen.render.xml_shapes import ANALYTIC, tessellated, turn_mirrored
+from rsgen.scene.xml_shapes import ANALYTIC, tessellated, turn_mirrored
 
 log = logging.getLogger("rsgen")
 

@@ -16,9 +16,9 @@ from rsgen.config.motion import ObjectConfig, ShapeConfig
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.formats import scene_reader
-from rsgen.render.material import Material, bsdf
-from rsgen.render.meshes import joined_triangles, ply_bytes, repair_meshes, surface
-from rsgen.render.placement import SceneOptions
+from rsgen.scene.material import Material, bsdf
+from rsgen.scene.meshes import joined_triangles, ply_bytes, repair_meshes, surface
+from rsgen.scene.placement import SceneOptions
 
 _SEGMENTS = 96  # squares around a ball or cylinder, at least
 _MOST_CHECKS = 20_000

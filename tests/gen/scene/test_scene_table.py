@@ -17,7 +17,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from rsgen.errors import UserError
-from rsgen.render.scene import content_hash, ensure_built, load_scene
+from rsgen.scene.loading import content_hash, ensure_built, load_scene
 from scenes.kit.pieces import Piece
 from scenes.kit.shapes import merge
 from scenes.living_room import layout, table

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
-from rsgen.render.meshes import ply_bytes, rebuilt
+from rsgen.scene.meshes import ply_bytes, rebuilt
 
 _MESHES = ("ply", "obj", "serialized", "cube")
 _MIRRORED = "rsgen_mirrored_"

@@ -10,8 +10,8 @@ from lit import scene_of
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import rows_of
 from rsgen.render.irradiance import make_lattice
-from rsgen.render.meshes import coarser, inhabited_box, mesh_arrays, split_triangles
-from rsgen.render.rays import rays_from
+from rsgen.scene.meshes import coarser, inhabited_box, mesh_arrays, split_triangles
+from rsgen.scene.rays import rays_from
 
 HOUSE = """<shape type="cube"><transform name="to_world"><scale x="3" y="2" z="1.5"/><translate z="1.4"/></transform>
     <bsdf type="diffuse"/></shape>"""
