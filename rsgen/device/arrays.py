@@ -102,9 +102,9 @@ def engine(backend: Backend = "auto") -> Engine:
 
 
 class Numbers:
-    """A dataclass whose numbers kernels are handed, and read as cheaply as constants: others need no other kernel.
+    """Base of dataclasses whose numbers are arguments of kernels, not constants: other values need no other kernel.
 
-    COMPILED: names of fields that are no such numbers.
+    COMPILED: names of the fields that are constants all the same.
     """
 
     COMPILED: ClassVar[tuple[str, ...]] = ()
@@ -114,7 +114,7 @@ class Numbers:
 
     @property
     def numbers(self) -> list[float]:
-        """Whole ones are handed over as such."""
+        """All others, in order; whole numbers stay whole on the device."""
         return [getattr(self, name) for name in self._names()]
 
     def traced(self, numbers: Sequence[Any]) -> Self:
@@ -154,9 +154,9 @@ def _handed(e: Engine, number: float) -> Any:
 
 
 def quotient(number: Any, by: Any, share: Any) -> Any:
-    """number // by of whole numbers below four million, exactly; share: one over `by`, for where that is the device's.
+    """number // by, exact for whole numbers below four million. share: one over `by`.
 
-    Dividing by what is not a constant takes the device ten times as long.
+    The device divides integers by constants in one go, and one by one by an argument of the kernel.
     """
     import drjit as dr
 

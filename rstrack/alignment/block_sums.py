@@ -31,7 +31,7 @@ PAIR_BLOCKS = 15
 # of the coupling, n (n + 1) / 2 of their own H and n of their g more; and padding.
 _SLOTS, _PAD = 31, 16
 _UPPER = np.triu_indices(6)
-# What numbers of blocks are rounded up to, see `room`.
+# What the number of blocks is rounded up to a multiple of, see `room`.
 _SPARE_BLOCKS = 64
 # Lanes that keep all cores of a CPU busy, and longest run: a longer one gains nothing.
 _LANES, _LONGEST = 1024, 40
@@ -214,7 +214,7 @@ def sizes(lens: Lens, ref_lens: Lens, columns: int = 0) -> tuple[int, int]:
 
 
 def room(lens: Lens, ref_lens: Lens, columns: int = 0) -> tuple[int, int]:
-    """`sizes` with a few blocks to spare: their number is compiled in, and most images have about as many."""
+    """`sizes` rounded up to a multiple of 64 blocks: the number is compiled in, and most images have 60 to 64."""
     size, values = sizes(lens, ref_lens, columns)
     spare = _SPARE_BLOCKS * _slots(columns)
     return -(-size // spare) * spare, values
@@ -299,8 +299,8 @@ def every(e: Engine, width: int, height: int, stride: int) -> PixelGrid:
 class Runs(Numbers):
     """Every stride-th pixel of an image in runs, each of one lane: along its rows, or down its columns.
 
-    along: pixels of a row, or of a column; lanes: that it is shared by, and one over that. total: of all lanes; alone:
-    whether each has one pixel.
+    width: of the image; columns: of these pixels. along: pixels of a row, or of a column; lanes: that share it, and
+    share is one over them. total: number of all lanes; alone: whether each has one pixel.
     """
 
     COMPILED: ClassVar[tuple[str, ...]] = ("total", "down", "alone")

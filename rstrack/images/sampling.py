@@ -22,9 +22,9 @@ NEAREST = 2.0
 
 @dataclass(frozen=True)
 class Raster(Numbers):
-    """Every stride-th pixel of every stride-th row of an image: its width, how many columns that are, one over both.
+    """Every stride-th pixel of every stride-th row of an image.
 
-    count: of the pixels.
+    width: of the image. columns, count: of these pixels. per_stride, per_column: one over stride and columns.
     """
 
     COMPILED: ClassVar[tuple[str, ...]] = ("count",)
@@ -160,7 +160,7 @@ def surface(e: Engine, camera: Camera, rho: Any, x: Any, y: Any, active: Any) ->
 
 @dataclass(frozen=True)
 class PyramidLevel(Numbers):
-    """Width and height of a level of a camera's images, and how large its pixels are against theirs, inverted."""
+    """Width and height of a pyramid's level, and by what a pixel of the image is multiplied to be one of the level."""
 
     width: int
     height: int
@@ -168,7 +168,7 @@ class PyramidLevel(Numbers):
 
     @classmethod
     def of(cls, camera: Camera, level: int) -> PyramidLevel:
-        """Halved so many times."""
+        """Of a camera's images, halved so many times."""
         return cls(level_size(camera.width, level), level_size(camera.height, level), 0.5**level)
 
 
