@@ -153,8 +153,8 @@ def _handed(e: Engine, number: float) -> Any:
     return e.UInt(aligned([number], np.uint32)) if isinstance(number, int) else e.upload(number)
 
 
-def quotient(number: Any, by: Any, share: Any) -> Any:
-    """number // by, exact for whole numbers below four million. share: one over `by`.
+def quotient(number: Any, by: Any) -> Any:
+    """number // by, exact for whole numbers below four million.
 
     The device divides integers by constants in one go, and one by one by an argument of the kernel.
     """
@@ -162,7 +162,8 @@ def quotient(number: Any, by: Any, share: Any) -> Any:
 
     if isinstance(by, int):
         return number // by
-    return type(number)((dr.float32_array_t(number)(number) + 0.5) * share)
+    Float = dr.float32_array_t(number)
+    return type(number)((Float(number) + 0.5) * dr.rcp(Float(by)))
 
 
 def recorded(function: Callable[..., Any], state: Callable[..., Any] | None = None) -> Callable[..., Any]:

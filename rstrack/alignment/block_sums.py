@@ -168,9 +168,7 @@ def _is_global(lens: Lens, ref_lens: Lens) -> bool:
 class Blocks(Numbers):
     """Blocks of an image's lines and of a reference's.
 
-    reference: how many the latter has. per, ref_per: lines of a block; share, ref_share: one over them. last_row: of
-    the image.
-
+    reference: how many the latter has. per, ref_per: lines of a block. last_row: of the image.
     rows: whether a pixel's own row counts, since all lines are exposed at once; pairs: whether the reference has more
     than one block.
     """
@@ -179,9 +177,7 @@ class Blocks(Numbers):
 
     reference: int
     per: int
-    share: float
     ref_per: int
-    ref_share: float
     last_row: int
     rows: bool
     pairs: bool
@@ -191,7 +187,7 @@ class Blocks(Numbers):
         """Of images of these lenses."""
         _, reference, per, ref_per = block_counts(lens, ref_lens)
         rows, last_row = _is_global(lens, ref_lens), lens.camera.height - 1
-        return cls(reference, per, 1.0 / per, ref_per, 1.0 / ref_per, last_row, rows, reference > 1)
+        return cls(reference, per, ref_per, last_row, rows, reference > 1)
 
 
 def block_slot(line: Any, ref_line: Any, blocks: Blocks, y: Any, columns: int = 0) -> Any:
@@ -201,9 +197,9 @@ def block_slot(line: Any, ref_line: Any, blocks: Blocks, y: Any, columns: int = 
     """
     if blocks.rows:
         line = type(line)(dr.clip(y, 0, blocks.last_row))
-    block = quotient(line, blocks.per, blocks.share)
+    block = quotient(line, blocks.per)
     if blocks.pairs:
-        block = block * blocks.reference + quotient(ref_line, blocks.ref_per, blocks.ref_share)
+        block = block * blocks.reference + quotient(ref_line, blocks.ref_per)
     return block * _slots(columns)
 
 
@@ -299,8 +295,8 @@ def every(e: Engine, width: int, height: int, stride: int) -> PixelGrid:
 class Runs(Numbers):
     """Every stride-th pixel of an image in runs, each of one lane: along its rows, or down its columns.
 
-    width: of the image; columns: of these pixels. along: pixels of a row, or of a column; lanes: that share it, and
-    share is one over them. total: number of all lanes; alone: whether each has one pixel.
+    width: of the image; columns: of these pixels. along: pixels of a row, or of a column; lanes: that share it. total:
+    number of all lanes; alone: whether each has one pixel.
     """
 
     COMPILED: ClassVar[tuple[str, ...]] = ("total", "down", "alone")
@@ -310,7 +306,6 @@ class Runs(Numbers):
     columns: int
     along: int
     lanes: int
-    share: float
     total: int
     down: bool
     alone: bool
@@ -321,7 +316,7 @@ class Runs(Numbers):
         columns, rows = -(-width // stride), -(-height // stride)
         along, across = (rows, columns) if down else (columns, rows)
         lanes = -(-along // _run(e, along, across))
-        return cls(width, stride, columns, along, lanes, 1.0 / lanes, across * lanes, down, lanes == along)
+        return cls(width, stride, columns, along, lanes, across * lanes, down, lanes == along)
 
 
 def summed(e: Engine, runs: Runs, of: tuple[int, int], at: Callable[[PixelGrid], Contribution], is_steady: bool) -> Any:
@@ -331,7 +326,7 @@ def summed(e: Engine, runs: Runs, of: tuple[int, int], at: Callable[[PixelGrid],
     """
     size, values_each = of
     lane = dr.arange(e.UInt, runs.total)
-    line = quotient(lane, runs.lanes, runs.share)
+    line = quotient(lane, runs.lanes)
     first = lane - line * runs.lanes
     sums = dr.zeros(e.Int, size)
 

@@ -122,9 +122,8 @@ def meeting_kernel(e: Engine, lens: Lens, other: Lens, stride: int, has_rays: bo
         _, seen, inside = _moved(e, lens, other, raster, has_rays, given)
         value, met = surface(e, other.camera, given.other, seen.x, seen.y, inside)
         apart = dr.select(met, dr.rcp(dr.select(met, value, 1.0)) - seen.z, _UNKNOWN)
-        column, row = (
-            e.UInt(e.Int(dr.select(inside, (v + 0.5) * there.per_stride, 0.0))) for v in (seen.x, seen.y)
-        )  # fmt: skip
+        share = dr.rcp(e.Float(there.stride))
+        column, row = (e.UInt(e.Int(dr.select(inside, (v + 0.5) * share, 0.0))) for v in (seen.x, seen.y))
         value = dr.gather(e.Float, given.values, row * there.columns + column, inside)
         handed = dr.select(inside, value, 2.0 * _UNKNOWN)
         return apart, handed

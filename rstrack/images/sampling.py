@@ -24,7 +24,7 @@ NEAREST = 2.0
 class Raster(Numbers):
     """Every stride-th pixel of every stride-th row of an image.
 
-    width: of the image. columns, count: of these pixels. per_stride, per_column: one over stride and columns.
+    width: of the image. columns, count: of these pixels.
     """
 
     COMPILED: ClassVar[tuple[str, ...]] = ("count",)
@@ -32,21 +32,19 @@ class Raster(Numbers):
     width: int
     stride: int
     columns: int
-    per_stride: float
-    per_column: float
     count: int
 
     @classmethod
     def of(cls, camera: Camera, stride: int = 1) -> Raster:
         """Of a camera's images."""
         columns, rows = (-(-size // stride) for size in (camera.width, camera.height))
-        return cls(camera.width, stride, columns, 1.0 / stride, 1.0 / columns, columns * rows)
+        return cls(camera.width, stride, columns, columns * rows)
 
 
 def grid(e: Engine, raster: Raster) -> tuple[Any, Any, Any]:
     """Index, x and y of the pixels."""
     i = dr.arange(e.UInt, raster.count)
-    row = quotient(i, raster.columns, raster.per_column)
+    row = quotient(i, raster.columns)
     if not isinstance(raster.columns, int):
         # Beyond four million it may be one off.
         row = dr.select(row * raster.columns > i, row - 1, row)

@@ -89,17 +89,14 @@ class PairGrid:
 class Compared(Numbers):
     """Every stride-th pixel of every stride-th row of depth images, which stand below each other or side by side.
 
-    points: of one image. share, per_column, per_row: one over the numbers before them.
+    points: of one image.
     """
 
     COMPILED = ("by_rows",)
 
     stride: int
-    share: float
     columns: int
-    per_column: float
     rows: int
-    per_row: float
     points: int
     by_rows: bool
 
@@ -107,19 +104,18 @@ class Compared(Numbers):
     def of(cls, lens: Lens, stride: int) -> Compared:
         """Of a depth camera."""
         columns, rows = (-(-size // stride) for size in (lens.camera.width, lens.camera.height))
-        shares = 1.0 / stride, 1.0 / columns, 1.0 / rows
-        return cls(stride, shares[0], columns, shares[1], rows, shares[2], columns * rows, lens.shutter.by_rows)
+        return cls(stride, columns, rows, columns * rows, lens.shutter.by_rows)
 
 
 def pair_grid(e: Engine, compared: Compared, pixels: PixelGrid, given: Given) -> PairGrid:
     """From pixels of images that stand below each other, or beside each other, in order of the pairs."""
     stride, columns = compared.stride, compared.columns
-    column, row = (quotient(v, stride, compared.share) for v in (pixels.x, pixels.y))
+    column, row = (quotient(v, stride) for v in (pixels.x, pixels.y))
     if compared.by_rows:
-        launched = quotient(row, compared.rows, compared.per_row)
+        launched = quotient(row, compared.rows)
         row = row - launched * compared.rows
     else:
-        launched = quotient(column, columns, compared.per_column)
+        launched = quotient(column, columns)
         column = column - launched * columns
     first, last = (dr.gather(e.UInt, given.launch, e.UInt(i)) for i in range(2))
     pair = dr.minimum(first + launched, last)
