@@ -94,9 +94,12 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
-        if young and not fault and track.scales.exceeded(on_reference):
+        is_odd = not found.whole or track.scales.exceeded(on_reference)
+        if young and not fault and is_odd:
             fault = Fault.MISFIT
-        if not rolls:
+        if weighs and is_odd:
+            uncertainty = uncertainty.found_anew(score.information)
+        elif not rolls:
             uncertainty = uncertainty.after(seconds, score.information, *accelerations)
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, score)
         if weighs:
