@@ -78,22 +78,20 @@ class Problem:
 def optimise(
     terms: Terms, state: SplineState, problem: Problem, levels: Sequence[int], most: Sequence[int],
     hopeless: Callable[[Sequence[Observation]], bool] | None = None,
-    before_finest: Callable[[], None] | None = None, resumes: bool = False,
+    before_finest: Callable[[], None] | None = None,
 ) -> Solved:  # fmt: skip
     """Minimise (12) by Levenberg-Marquardt on each of the pyramid's levels, coarse to fine, most[level] steps at most.
 
     A level ends when no line of the fresh images moves any more. Steps that raise the cost are taken back and damped.
     hopeless: given the fresh observations after each level; True skips the finer ones.
     before_finest: called before the last level if others were before it; may change what the fresh ones see.
-    resumes: the fresh ones were aligned on this level before, and count otherwise now: linearisations stay as long as
-    they are good.
     Raises numpy.linalg.LinAlgError where the system has no solution.
     """
     done = Solved()
     for level in levels:
         if before_finest is not None and level == levels[-1] != levels[0]:
             before_finest()
-        for observation in () if resumes else problem.fresh:
+        for observation in problem.fresh:
             observation.restart(state, keep_sigma=level != levels[0])
         _optimise_level(terms, state, problem, level, most[level], done)
         if hopeless is not None and hopeless(problem.fresh):

@@ -62,7 +62,7 @@ def match(
     found = Match(new, ref, window, window.spline, fresh, Solved(), LeftOut(new.depth))
     solve(hopeless)
     if not is_settled(found.solved) and not is_hopeless(fresh):
-        found.again(resumes=False)
+        found.again()
     fitting = without_misfits(fresh, ref)
     if len(fitting) < len(fresh) and not is_hopeless(found.on_reference):
         found.window, found.fresh, found.whole = begin(), fitting, False
@@ -89,7 +89,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     if weighs and not young:
         innovation = weighed(fresh, window.state, predicted, considered)
         if innovation.inflation > 1.0:
-            found.again(resumes=True)
+            found.again()
     on_reference = found.on_reference
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)

@@ -65,14 +65,16 @@ class Match:
         """What the frame's images say against `ref`, not against other keyframes."""
         return [o for o in self.fresh if o.ref.index == self.ref.index]
 
-    def again(self, resumes: bool) -> None:
-        """Align at full size from where it is: its observations count otherwise now (resumes), or its steps went to and
-        fro. Not where there is no time left."""
+    def again(self) -> None:
+        """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro.
+
+        Not where there is no time left.
+        """
         if not self.window.has_time:
             self.solved.is_cut = True
             return
         self.solved = self.window.solve(
-            self.fresh, (0,), gauge_of(self.window, self.frame, self.ref), is_rolling(self.ref), resumes=resumes
+            self.fresh, (0,), gauge_of(self.window, self.frame, self.ref), is_rolling(self.ref)
         )
 
 

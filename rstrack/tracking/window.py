@@ -150,12 +150,12 @@ class Window:
     def solve(
         self, fresh: Sequence[Observation], levels: Sequence[int] = LEVELS, gauge: Reference | None = None,
         coupled: bool = False, hopeless: Callable[[Sequence[Observation]], bool] | None = None,
-        before_finest: Callable[[], None] | None = None, resumes: bool = False,
+        before_finest: Callable[[], None] | None = None,
     ) -> Solved:  # fmt: skip
         """Align fresh observations, together with the active ones, by moving the free control points.
 
         gauge: a reference at whose pose the spline is held. coupled: lines depend on control points far apart, as those
-        against a reference that moves too. hopeless, before_finest, resumes: see `optimise`. What was
+        against a reference that moves too. hopeless, before_finest: see `optimise`. What was
         solved for becomes active with `keep`.
         """
         free = self.first_free, self.state.end
@@ -167,7 +167,7 @@ class Window:
         problem = Problem(fresh, self.active, free, priors, self._focal, bandwidth, predicted=self._is_held)
         try:
             with self._terms.timer("optimiser"):
-                return optimise(self._terms, self.state, problem, levels, MOST_STEPS, hopeless, before_finest, resumes)
+                return optimise(self._terms, self.state, problem, levels, MOST_STEPS, hopeless, before_finest)
         except np.linalg.LinAlgError:
             # The images say nothing about some motion, not even with the prior: as lost as can be.
             return Solved()

@@ -123,19 +123,6 @@ def test_to_relinearise_only_what_has_moved_leads_to_the_same_place(monkeypatch:
     assert evaluations[0] < 0.6 * evaluations[1]
 
 
-@pytest.mark.parametrize("resumes", [False, True])
-def test_what_counts_otherwise_afterwards_is_aligned_from_where_it_is(resumes: bool) -> None:
-    state, terms = SplineState(TRUTH), PoseTerms()
-    one, other = sighting(TIMES, TRUTH.pose(TIMES)), sighting(TIMES, aside(TRUTH, 0.04).pose(TIMES))
-    run(terms, state, [one, other], state)
-    assert shift_px(state.spline, aside(TRUTH, 0.02)) < 1e-4
-    other.count_as(0.25)
-    done = optimise(terms, state, problem([one, other], state), (0,), MOST, resumes=resumes)  # type: ignore[arg-type]
-    # It has moved by less than calls for a linearisation: those of before are as good as new ones.
-    assert done.evaluations == (0 if resumes else 2)
-    assert shift_px(state.spline, aside(TRUTH, 0.008)) < 1e-4
-
-
 @pytest.mark.parametrize(("px", "is_kept"), [(0.019, True), (0.021, False)])
 def test_settled_models_are_kept_while_their_lines_hardly_move(px: float, is_kept: bool) -> None:
     state = SplineState(TRUTH)
