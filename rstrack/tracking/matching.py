@@ -73,9 +73,10 @@ def match(
 def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) -> Verdict:
     """Whether a frame was found where the motion led; gap: s since the one before.
 
-    young: its segment of the spline has just begun, and predicts little. A rolling reference moves with what is aligned
-    to it, and does not bind the two. A gyroscope sees how rows move within an image that vibrates, which the filter
-    does not. Under the wrong shutter all images are off. In these cases no prediction is held against them.
+    young: its segment of the spline has just begun, and predicts little: all of its images have to fit. A rolling
+    reference moves with what is aligned to it, and does not bind the two. A gyroscope sees how rows move within an
+    image that vibrates, which the filter does not. Under the wrong shutter all images are off. In these cases no
+    prediction is held against them.
     """
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
@@ -94,13 +95,16 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
+        # Images that do not fit as the last ones did may show another place: that of the prediction is not known then.
         is_odd = not found.whole or track.scales.exceeded(on_reference)
         if young and not fault and is_odd:
             fault = Fault.MISFIT
-        if weighs and is_odd:
-            uncertainty = uncertainty.found_anew(score.information)
-        elif not rolls:
-            uncertainty = uncertainty.after(seconds, score.information, *accelerations)
+        if not rolls:
+            seen = score.information
+            if weighs and is_odd:
+                uncertainty = uncertainty.found_anew(seen)
+            else:
+                uncertainty = uncertainty.after(seconds, seen, *accelerations)
             common = track.covariances.after(seconds, uncertainty, on_reference, window.state, score)
         if weighs:
             more = mixture(innovation, on_reference, window.state, predicted, considered)
