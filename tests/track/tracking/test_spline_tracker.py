@@ -179,7 +179,7 @@ def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:
 
 @pytest.mark.parametrize("elsewhere", [True, False])
 def test_before_a_wall_a_frame_of_other_colours_may_be_anywhere(elsewhere: bool) -> None:
-    """Regression: depth has it on the wall, and where along it the motion before was held to know (0.5 m off, silently)."""
+    """Regression: depth has it on the wall, and where along it the motion before was held to know: 0.5 m off."""
     tracker = Tracker(Rig(CAMERA, GLOBAL, CAMERA, GLOBAL, np.eye(4)), Options(method="gs-pg"))
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
     z, rng = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), np.random.default_rng(0)
