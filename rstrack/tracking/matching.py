@@ -95,9 +95,9 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
-        # Images that do not fit as the last ones did may show another place: that of the prediction is not known then.
-        is_odd = not found.whole or track.scales.exceeded(on_reference)
-        if young and not fault and is_odd:
+        # Images that fit far worse than the last ones may show another place: that of the prediction is not known then.
+        is_odd = track.scales.exceeded(on_reference)
+        if young and not fault and (is_odd or not found.whole):
             fault = Fault.MISFIT
         if not rolls:
             seen = score.information
