@@ -178,21 +178,22 @@ def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:
 
 
 @pytest.mark.parametrize("elsewhere", [True, False])
-def test_before_a_wall_a_frame_of_other_colours_may_be_anywhere(elsewhere: bool) -> None:
-    """Regression: depth has it on the wall, and where along it the motion before was held to know: 0.5 m off."""
+def test_just_found_before_a_wall_a_frame_of_other_colours_may_be_anywhere(elsewhere: bool) -> None:
+    """Regression: depth has it on the wall, and where along it so short a motion was held to know: 0.5 m off."""
     tracker = Tracker(Rig(CAMERA, GLOBAL, CAMERA, GLOBAL, np.eye(4)), Options(method="gs-pg"))
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
     z, rng = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), np.random.default_rng(0)
-    for k in range(14):
+    for k in range(26):
         x = u + 120.0 * (0.01 * k) / 2.0
         shown = 120.0 + 50.0 * np.sin(x / 7.0) * np.cos(v / 9.0) + 40.0 * np.sin(x / 31.0 + v / 23.0)
-        if k == 11 and elsewhere:
+        is_black = 9 <= k < 20
+        if k == 22 and elsewhere:
             shown = rng.uniform(0.0, 255.0, z.shape)
-        color = np.repeat(shown[..., None].astype(np.uint8), 3, axis=2)
-        report = tracker.feed(Frame(Image(k / 30, z), (Image(k / 30, color),)))
-        assert report.lost == (k == 11 and elsewhere), (k, report.fault)
+        color = np.repeat(shown[..., None].astype(np.uint8), 3, axis=2) * (not is_black)
+        report = tracker.feed(Frame(Image(k / 30, z * (not is_black)), (Image(k / 30, color),)))
+        assert report.lost == (is_black or (k == 22 and elsewhere)), (k, report.fault)
     x = tracker.trajectory[1][:, 0, 3]
-    np.testing.assert_allclose(x[-1] - x[0], 0.13, atol=3e-3)
+    np.testing.assert_allclose(x[-1] - x[0], 0.25, atol=3e-3)
 
 
 def test_nothing_but_blank_frames() -> None:
