@@ -177,23 +177,38 @@ def test_a_keyframe_whose_colours_are_another_places_is_left() -> None:
     assert tracker.keyframes == 2 and worst_step(tracker) < 3e-3
 
 
+def at_a_wall(k: int, is_odd: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and colour of frame k of a camera that moves along a wall by 1 cm a frame; or noisy and random ones."""
+    rng, (v, u) = np.random.default_rng(0), np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
+    x = u + CAMERA.fx * (0.01 * k) / 2.0
+    grey = 120.0 + 50.0 * np.sin(x / 7.0) * np.cos(v / 9.0) + 40.0 * np.sin(x / 31.0 + v / 23.0)
+    z = np.full(grey.shape, 2.0)
+    if is_odd:
+        z, grey = z + 0.03 * rng.normal(size=z.shape), rng.uniform(0.0, 255.0, z.shape)
+    return z.astype(np.float32), np.repeat(grey[..., None].astype(np.uint8), 3, axis=2)
+
+
 @pytest.mark.parametrize("elsewhere", [True, False])
 def test_just_found_before_a_wall_a_frame_of_other_colours_may_be_anywhere(elsewhere: bool) -> None:
     """Regression: depth has it on the wall, and where along it so short a motion was held to know: 0.5 m off."""
     tracker = Tracker(Rig(CAMERA, GLOBAL, CAMERA, GLOBAL, np.eye(4)), Options(method="gs-pg"))
-    v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
-    z, rng = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32), np.random.default_rng(0)
     for k in range(26):
-        x = u + 120.0 * (0.01 * k) / 2.0
-        shown = 120.0 + 50.0 * np.sin(x / 7.0) * np.cos(v / 9.0) + 40.0 * np.sin(x / 31.0 + v / 23.0)
-        is_black = 9 <= k < 20
-        if k == 22 and elsewhere:
-            shown = rng.uniform(0.0, 255.0, z.shape)
-        color = np.repeat(shown[..., None].astype(np.uint8), 3, axis=2) * (not is_black)
-        report = tracker.feed(Frame(Image(k / 30, z * (not is_black)), (Image(k / 30, color),)))
-        assert report.lost == (is_black or (k == 22 and elsewhere)), (k, report.fault)
+        is_black, is_odd = 9 <= k < 20, k == 22 and elsewhere
+        z, color = at_a_wall(k)[0], at_a_wall(k, is_odd)[1]
+        report = tracker.feed(Frame(Image(k / 30, z * (not is_black)), (Image(k / 30, color * (not is_black)),)))
+        assert report.lost == (is_black or is_odd), (k, report.fault)
     x = tracker.trajectory[1][:, 0, 3]
     np.testing.assert_allclose(x[-1] - x[0], 0.25, atol=3e-3)
+
+
+@pytest.mark.parametrize("is_odd", [True, False])
+def test_where_an_image_fits_far_worse_than_usual_the_motion_before_does_not_make_a_pose_known(is_odd: bool) -> None:
+    """Regression: a pose that no image determined was given, 0.1 m off; as good an image as usual may be led."""
+    tracker = Tracker(Rig(CAMERA, GLOBAL, CAMERA, GLOBAL, np.eye(4)), Options(method="gs-pg"))
+    for k in range(14):
+        z, color = at_a_wall(k, is_odd and k == 11)
+        report = tracker.feed(Frame(Image(k / 30, z), () if k == 11 else (Image(k / 30, color),)))
+        assert report.lost == (k == 11 and is_odd), (k, report.fault)
 
 
 def test_nothing_but_blank_frames() -> None:
