@@ -29,12 +29,12 @@ FLOOR_DEPTH, FLOOR_INTENSITY = 2e-4, 1.0 / 255.0
 GATE_SIGMAS, GATE_INTENSITY = 5.0, 0.3
 """Residuals beyond these, in σ of depth and in intensity, are outliers for certain."""
 
-# Blocks of lines over which errors may be correlated: 7 reach over an eighth of the image.
-_REACH = 7
+# Part of an image's blocks of lines over which errors may be correlated, one in so many.
+_REACH = 8
 # Pixels below which an image's inflation cannot be estimated.
 _LEAST_PIXELS = 500
-# Frames over which the median is taken, and below which nothing is known yet.
-_MEMORY, _FEW = 30, 3
+# Frames over which the median is taken.
+_MEMORY = 30
 
 
 def weight(s: Any) -> Any:
@@ -63,20 +63,21 @@ def scale_step(sigma: float, weighted: float, count: int, floor: float) -> float
 def inflation(H: FloatArray, g: FloatArray, count: int) -> float:
     """Factor by which the covariance H⁻¹ of a twist is too small, tr(H⁻¹ M)/6: about 1 if pixels are independent.
 
-    H (n, 1, 6, 6), g (n, 1, 6): of n blocks of lines and a rectified reference, made from `count` pixels. M: covariance
-    of the summed gradient as the blocks' own gradients show it, correlated over up to _REACH blocks (Newey and West,
-    Econometrica 1987), as a sandwich estimator takes it. NaN for a rolling reference and with too few pixels.
+    H (n, m, 6, 6), g (n, m, 6): of n blocks of lines and m of the reference's, made from `count` pixels. M: covariance
+    of the summed gradient as the image's blocks' own gradients show it, correlated over an eighth of them (Newey and
+    West, Econometrica 1987), as a sandwich estimator takes it. NaN with too few pixels or blocks.
     """
-    if H.shape[1] != 1 or len(H) <= _REACH or count < _LEAST_PIXELS:
+    reach = len(H) // _REACH
+    if not reach or count < _LEAST_PIXELS:
         return float("nan")
-    H, g = H[:, 0], g[:, 0]
+    H, g = H.sum(axis=1), g.sum(axis=1)
     total = H.sum(axis=0)
     try:
         r = g - H @ np.linalg.solve(total, g.sum(axis=0))
         M = r.T @ r
-        for lag in range(1, _REACH + 1):
+        for lag in range(1, reach + 1):
             pairs = r[lag:].T @ r[:-lag]
-            M += (1.0 - lag / (_REACH + 1)) * (pairs + pairs.T)
+            M += (1.0 - lag / (reach + 1)) * (pairs + pairs.T)
         return float(np.trace(np.linalg.solve(total, M))) / 6.0
     except np.linalg.LinAlgError:
         return float("nan")
@@ -95,4 +96,4 @@ class Independence:
     @property
     def inflation(self) -> float:
         """The median, never below 1."""
-        return max(1.0, float(np.median(self._seen))) if len(self._seen) >= _FEW else 1.0
+        return max(1.0, float(np.median(self._seen))) if self._seen else 1.0

@@ -88,7 +88,9 @@ def bootstrap(track: TrackState, new: DeviceFrame) -> FrameReport:
     if lost(fresh, solved, ref.pixels):
         return _begin_anew(track, new)
     track.scales.learn(fresh)
+    track.learn_independence(fresh)
     window.keep(fresh)
+    track.count(window.active)
     recent = track.succession.recent
     recent.append(new)
     for n, one in enumerate(reversed(left), 1):

@@ -195,9 +195,13 @@ class TrackState:
         if expected is None:
             expected = self.gains.expected(frame, ref)
         observations = observe(frame, ref, self.options, expected)
-        for o in observations:
-            o.independent = 1.0 / self.independence[not o.is_depth].inflation
+        self.count(observations)
         return observations
+
+    def count(self, observations: Sequence[Observation]) -> None:
+        """Let the pixels of observations count as far as they are independent by what is known now."""
+        for o in observations:
+            o.count_as(1.0 / self.independence[not o.is_depth].inflation)
 
     def learn(self, found: Match, excess: float, new: DeviceFrame) -> None:
         """What frame `new`, found where the motion led, says of the spline, the IMU and its own pixels.
@@ -207,8 +211,12 @@ class TrackState:
         self.age += 1
         self.succession.recent.append(new)
         self.learn_motion(found.ref, found.on_reference, found.window, excess, new.last_time)
+        self.learn_independence(found.on_reference)
+
+    def learn_independence(self, fresh: Sequence[Observation]) -> None:
+        """How far the pixels of a frame that was found are independent, by its observations."""
         for is_color, term in enumerate(self.independence):
-            term.learn(o.inflation for o in found.on_reference if o.is_depth != is_color)
+            term.learn(o.inflation for o in fresh if o.is_depth != is_color)
 
     def learn_motion(
         self, ref: Reference, seen: Sequence[Observation], window: Window, excess: float, end: float
