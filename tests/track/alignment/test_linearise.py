@@ -172,6 +172,20 @@ def test_errors_of_neighbouring_lines_are_seen_where_all_are_exposed_at_once_too
     assert least < lin.inflation < most
 
 
+@pytest.mark.parametrize(("rows", "least", "most"), [(1, 0.3, 2.5), (8, 3.0, 60.0)])
+def test_errors_of_neighbouring_lines_are_seen_against_a_rolling_reference_too(
+    rows: int, least: float, most: float
+) -> None:
+    camera, truth = small_camera(width=160, height=120), synthetic.make_spline()
+    image = exposure(0.30, "top-bottom", camera)
+    ref = maker(camera).rolling(1, depth_input(synthetic.cast, truth, exposure(0.25, "top-bottom", camera)), (), truth)
+    noise = np.random.default_rng(2).normal(0.0, 2e-3, (camera.height // rows, 160 if rows == 1 else 8))
+    noise = noise.repeat(rows, axis=0).repeat(camera.width // noise.shape[1], axis=1)
+    seen = depth_image(ENGINE, image, depth_of(synthetic.cast, truth, image) + noise, 100.0)
+    lin = Terms(ENGINE, maker(camera).device_rays).geometric(seen, ref, truth, 0, 2e-3)()
+    assert lin.sums.H.shape[1] > 1 and least < lin.inflation < most
+
+
 @pytest.mark.parametrize("off_by", [1e-9, 1e-3, 1.0])
 def test_what_a_depth_image_is_off_by_as_a_whole_is_no_part_of_the_model(off_by: float) -> None:
     truth, image = synthetic.make_spline(), exposure(0.30, "top-bottom", DEPTH)

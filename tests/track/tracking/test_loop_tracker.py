@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,15 @@ from rstrack.tracking.runs import checkpoint
 from rstrack.tracking.runs.run import track
 
 ONLINE = replace(OPTIONS, loops="online")
+NEW = loop_tracker._NEW
+
+
+@pytest.fixture(scope="module", autouse=True)
+def little_is_news() -> Iterator[None]:
+    """Within a second the camera drifts by less than what would be closed while it goes on."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop_tracker, "_NEW", 5.0)
+        yield
 
 
 @pytest.fixture
@@ -139,6 +149,7 @@ def test_nothing_is_adjusted_for_loops_that_say_nothing_new(dataset: Dataset, mo
     calls = []
     real = loop_tracker.closed
     monkeypatch.setattr(loop_tracker, "closed", lambda *given: (calls.append(1), real(*given))[1])
+    monkeypatch.setattr(loop_tracker, "_NEW", NEW)
     tracker = LoopTracker(dataset.rig, ONLINE, load=dataset.frame)
     for k in range(FRAMES):
         tracker.feed(dataset.frame(k))

@@ -18,7 +18,7 @@ from rstrack.tracking.spline_tracker import Tracker
 
 TRUTH = synthetic.make_spline(0.5)
 FRAMES = 16
-RADIUS = 0.27
+RADIUS = 0.3
 
 
 def made(k: int, radius: float) -> tuple[Frame, np.ndarray]:

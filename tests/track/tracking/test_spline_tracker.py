@@ -15,6 +15,7 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rstrack.alignment.weights import Independence
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Method, Options
 from rstrack.tracking import bootstrap
@@ -152,6 +153,24 @@ def test_colour_may_come_late_but_there_is_no_keyframe_without_it() -> None:
     tracker = feed(tracker_of("rs-pg"), [blank(frame_at(0)), *list(frames(8))[1:]])
     assert lost(tracker) == [0, 1, 2, 3, 4, 5]
     assert [report.fault for report in tracker.reports[:6]] == [Fault.NO_START] * 6
+
+
+def test_first_frames_count_as_little_as_their_errors_hang_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Depth that is off by the same over blocks of pixels, by others in each frame, as a structured-light camera's."""
+
+    def error_m() -> float:
+        rng, frames = np.random.default_rng(5), []
+        for frame in map(frame_at, range(6)):
+            off = rng.normal(1.0, 0.01, (6, 8)).repeat(20, axis=0).repeat(20, axis=1)
+            depth = (frame.depth.pixels * off).astype(np.float32)
+            frames.append(replace(frame, depth=replace(frame.depth, pixels=depth)))
+        tracker = feed(tracker_of("rs-pg"), frames)
+        assert not lost(tracker)
+        return worst_step(tracker)
+
+    counted = error_m()
+    monkeypatch.setattr(Independence, "inflation", 1.0)
+    assert counted < 0.5 * error_m()
 
 
 def test_first_frames_that_slide_are_lost_and_the_next_ones_begin_anew(monkeypatch: pytest.MonkeyPatch) -> None:
