@@ -35,6 +35,7 @@ from rstrack.bench.tables import (
 )
 
 PAPERS_GROUPS = ("hand-held", "living room")
+_STARTS = "starts"
 _IMU = ("rs-pgi", "rs-gi")
 _REFINED = {"ATE": "ate_mm_ratio", "drift": "drift_mm_s_ratio"}
 _ERRORS = ("ATE, mm", "mm/s", "deg/s")
@@ -97,18 +98,11 @@ def real(full: Records) -> list[str]:
     return _section("Real recordings: ATE mm · mm/s · deg/s", table, records, clock, "")
 
 
-def imu(full: Records) -> list[str]:
-    """With an IMU and without: averages of groups, and the cases of no group above."""
-    tracks = [record for record in of_measure(full, "track") if _is_close(record)]
-    return _beside("With an IMU", tracks, lambda record: record.program in _IMU)
-
-
 def loops(full: Records) -> list[str]:
-    """With loops closed and without, and how true loops are."""
-    tracks = of_measure(full, "track")
-    closing = {record.method: record.program for record in tracks if "loops" in record.options}
-    shown = [record for record in tracks if record.method in {*closing, *closing.values()}]
-    lines = _beside("Loops closed, and not", shown, lambda record: record.method in closing)
+    """With an IMU, with loops closed, and without, and how true loops are."""
+    tracks = [record for record in of_measure(full, "track") if _is_close(record)]
+    chosen = lambda record: record.program in _IMU or "loops" in record.options  # noqa: E731
+    lines = _beside("With an IMU, with loops closed, and without", tracks, chosen)
     found = of_measure(full, "loops")
     if found:
         table = measured_table(found, _COLUMNS["loops"]).markdown()
@@ -157,10 +151,22 @@ def readout(full: Records) -> list[str]:
 
 def others(full: Records) -> list[str]:
     """Sequences of no group above."""
-    shown = {*PAPERS_GROUPS, "real", "", FAMILY}
+    shown = {*PAPERS_GROUPS, "real", "", FAMILY, _STARTS}
     tracks = of_measure(full, "track")
     records = [record for record in tracks if record.group not in shown and not record.is_change]
     return _section("Other sequences: ATE, mm", by_case(records), records)
+
+
+def starts(full: Records) -> list[str]:
+    """Tracks begun at other frames, whose mean says more than one does: a line."""
+    records, parts = of_group(full, _STARTS), []
+    for sequence in sequences_of(records):
+        errors = [value for r in records if r.sequence == sequence for value in r.values("ate_mm")]
+        lost = sum(r.total("lost") for r in records if r.sequence == sequence)
+        mark = "†" if lost else ""
+        parts.append(f"`{sequence}` {significant(geometric_mean(errors))}{mark} ({significant(max(errors))})")
+    text = "Begun at three to five frames of each, `rs-pg`, ATE in mm, geometric mean (worst): " + ", ".join(parts)
+    return [text + ".", ""] if parts else []
 
 
 def speed(full: Records) -> list[str]:

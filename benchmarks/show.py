@@ -81,8 +81,8 @@ _HEADLINE = {
 def results_markdown(gate: Records, full: Records) -> str:
     """All of docs/results.md. Cells that the full tier has not are the gate's; empty sections are left out."""
     parts = (
-        sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.imu, sections.loops,
-        sections.faults, sections.changes, cliff, sections.readout, sections.speed, sections.memory,
+        sections.methods, sections.per_sequence, sections.real, sections.not_the_best, sections.loops,
+        sections.faults, sections.changes, cliff, sections.starts, sections.readout, sections.speed, sections.memory,
         sections.measured("Calibration", "calibration"),
         sections.measured("Wrong lenses, calibrated: RMS over the image", "lens"),
         sections.measured("With the camera found on another recording", "crossed"),

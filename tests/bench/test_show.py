@@ -108,7 +108,7 @@ def test_results_have_every_section_and_are_short(gate: dict[str, CellRecord], f
     assert "0.500 · 0.300 · 0.0100" in row(section(text, "Real recordings"), "rs-pg")
     assert "0.500" in row(section(text, "ATE by sequence"), "rs-pg")
     assert "0.300 · 0.180 · 0.00600" in row(section(text, "With an IMU"), "hand-held")
-    assert "0.400 · 0.240 · 0.00800" in row(section(text, "Loops closed"), "real")
+    assert "0.400 · 0.240 · 0.00800" in row(section(text, "With an IMU"), "real")
     faults = section(text, "Faults")
     assert row(faults, "all") == "| `all` | 6 | 1 | 1 | 15 | 6 of 6 | - |"
     assert "13.4" in section(text, "What may be wrong") and "demo-late_13ms" in text
