@@ -101,8 +101,10 @@ def real(full: Records) -> list[str]:
 def loops(full: Records) -> list[str]:
     """With an IMU, with loops closed, and without, and how true loops are."""
     tracks = [record for record in of_measure(full, "track") if _is_close(record)]
-    chosen = lambda record: record.program in _IMU or "loops" in record.options  # noqa: E731
-    lines = _beside("With an IMU, with loops closed, and without", tracks, chosen)
+    lines = _beside(
+        "With an IMU, with loops closed, and without", tracks,
+        lambda record: record.program in _IMU or "loops" in record.options,
+    )  # fmt: skip
     found = of_measure(full, "loops")
     if found:
         table = measured_table(found, _COLUMNS["loops"]).markdown()
@@ -161,10 +163,11 @@ def starts(full: Records) -> list[str]:
     """Tracks begun at other frames, whose mean says more than one does: a line."""
     records, parts = of_group(full, _STARTS), []
     for sequence in sequences_of(records):
-        errors = [value for r in records if r.sequence == sequence for value in r.values("ate_mm")]
-        lost = sum(r.total("lost") for r in records if r.sequence == sequence)
-        mark = "†" if lost else ""
-        parts.append(f"`{sequence}` {significant(geometric_mean(errors))}{mark} ({significant(max(errors))})")
+        mine = [record for record in records if record.sequence == sequence]
+        errors = [value for record in mine for value in record.values("ate_mm")]
+        mark = "†" if any(record.total("lost") for record in mine) else ""
+        found = f"{significant(geometric_mean(errors))}{mark} ({significant(max(errors))})" if errors else "lost"
+        parts.append(f"`{sequence}` {found}")
     text = "Begun at three to five frames of each, `rs-pg`, ATE in mm, geometric mean (worst): " + ", ".join(parts)
     return [text + ".", ""] if parts else []
 
