@@ -29,12 +29,14 @@ from rstrack.tracking.window import Window
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """fault: why a frame has not been found. score: by its images; uncertainty, common: of it, if it has been."""
+    """fault: why a frame has not been found. score: by its images; uncertainty, common: of it, if it has been. is_odd:
+    an image fits far worse than the last ones."""
 
     fault: Fault
     score: Scores
     uncertainty: Uncertainty
     common: Common
+    is_odd: bool = False
 
 
 def match(
@@ -70,18 +72,19 @@ def match(
     return found
 
 
-def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) -> Verdict:
+def judge_predicted(track: TrackState, found: Match, gap: float, young: bool, after_lost: bool) -> Verdict:
     """Whether a frame was found where the motion led; gap: s since the one before.
 
-    young: its segment of the spline has just begun, and predicts little: all of its images have to fit. A rolling
-    reference moves with what is aligned to it, and does not bind the two. A gyroscope sees how rows move within an
-    image that vibrates, which the filter does not. Under the wrong shutter all images are off. In these cases no
-    prediction is held against them.
+    young: its segment of the spline has just begun, and predicts little: all of its images have to fit. So they have
+    after a frame that is lost (after_lost): depth alone slides along what is flat. A rolling reference moves with what
+    is aligned to it, and does not bind the two. A gyroscope sees how rows move within an image that vibrates, which the
+    filter does not. Under the wrong shutter all images are off. In these three cases no prediction is held against
+    them.
     """
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
     mid, rolls = new.depth.exposure.mid_time, is_rolling(found.ref)
-    T_predicted, seconds = found.predicted.pose(mid), new.stamp - track.found.stamps[-1]
+    T_predicted, seconds = found.predicted.pose(mid), new.stamp - track.found.last
     accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
     considered = track.covariances.considered(seconds)
     state = uncertainty.predicted(seconds, *accelerations)
@@ -97,7 +100,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
         fault = lost(on_reference, found.solved, found.ref.pixels)
         # Images that fit far worse than the last ones may show another place: that of the prediction is not known then.
         is_odd = track.scales.exceeded(on_reference)
-        if young and not fault and (is_odd or not found.whole):
+        if not fault and ((young and is_odd) or ((young or after_lost) and not found.whole)):
             fault = Fault.MISFIT
         if not rolls:
             seen = score.information
@@ -123,7 +126,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
         track.scales.learn(on_reference)
         if implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.MOTION
-    return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
+    return Verdict(fault or _unknown(uncertainty), score, uncertainty, common, is_odd)
 
 
 def unfinished(solved: Solved, state: SplineState, t: float) -> FloatArray:

@@ -110,7 +110,13 @@ class Tracker:
         fresh = track.observe(new, ref) + ([] if anchor is None else track.observe(new, anchor))
         levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
         found = match(track, predict, new, ref, fresh, levels, track.succession.recent[-1].depth)
-        verdict = judge_predicted(track, found, gap, young)
+        after_lost = not led and track.found.last < track.reports[-1].stamp
+        verdict = judge_predicted(track, found, gap, young, after_lost)
+        if verdict.fault is Fault.UNKNOWN and found.is_checked and not (verdict.is_odd or led):
+            # All of it fits, and the next frames may determine what it leaves open: the track goes on through it.
+            new = self._accept(found, verdict)
+            track.found.follow(new)
+            return track.report(new, found.on_reference, found.solved, fault=verdict.fault)
         if verdict.fault:
             return self._search(found, verdict.fault, gap, led)
         self._bridge.close(track)

@@ -65,6 +65,11 @@ class Match:
         """What the frame's images say against `ref`, not against other keyframes."""
         return [o for o in self.fresh if o.ref.index == self.ref.index]
 
+    @property
+    def is_checked(self) -> bool:
+        """Whether depth and colour both fit the reference: what one of them alone has found, nothing confirms."""
+        return self.whole and len(self.on_reference) > 1
+
     def again(self) -> None:
         """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro.
 
