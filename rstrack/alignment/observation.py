@@ -103,6 +103,11 @@ class Observation:
         return round(self.linearisation.stands_for * self.lin.count)
 
     @property
+    def scale(self) -> float:
+        """Of its residuals; depth's as it would be at one metre."""
+        return self.lin.next_sigma / (self.ref.median_depth**2 if self.is_depth else 1.0)
+
+    @property
     def inflation(self) -> float:
         """That of the linearisation, by pixels of the finest level; see `weights.inflation`."""
         return self.linearisation.stands_for * self.lin.inflation
@@ -111,15 +116,6 @@ class Observation:
     def stands_for(self) -> float:
         """Independent pixels of the finest level for each that was looked at."""
         return self.independent * self.linearisation.stands_for
-
-    @property
-    def known_for(self) -> float:
-        """The same, where this image's own residuals hang together more than those of the images before.
-
-        So they do where the spline cannot follow what moves within an image. It still holds the spline as others do.
-        """
-        own = self.independent * self.inflation
-        return self.stands_for / own if own > 1.0 else self.stands_for
 
     def see(self, ref: Reference) -> None:
         """Take another version of the reference, nearly the same."""
@@ -210,15 +206,16 @@ class Observation:
         The first six move all lines, the others as much as a line is after mid readout: the last by all of it, the
         first by its opposite (no line if all are exposed at once). All control points moved by one left increment move
         every pose by it; by one that grows with their times (Greville), by one that grows with the pose's, to first
-        order. Its pixels count as `known_for`.
+        order.
         """
-        now, known, last = self._now(state), self.known_for, self._last_steady
-        if last is None or last[0] is not now or last[1] != known:
+        now, last = self._now(state), self._last_steady
+        if last is None or last[0] is not now or last[1] != self.stands_for:
             model, exposure = now.model, self.image.exposure
             mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
             at = state.spline.t0 + (np.arange(model.first, model.last) - 1) * state.dt
             after = (at - mid) / half if half > 0.0 else np.zeros(len(at))
             H, g = _steady(model.H, model.g, after, *motion(state.spline, mid)[0][:3, 3])
+            known = self.stands_for
             self._last_steady = last = now, known, (known * H, known * g)
         return last[2]
 

@@ -113,10 +113,12 @@ class Tracker:
         after_lost = not led and track.found.last < track.reports[-1].stamp
         verdict = judge_predicted(track, found, gap, young, after_lost)
         if verdict.fault is Fault.UNKNOWN and found.is_checked and not (verdict.is_odd or led):
-            # All of it fits, and the next frames may determine what it leaves open: the track goes on through it.
-            new = self._accept(found, verdict)
-            track.found.follow(new)
-            return track.report(new, found.on_reference, found.solved, fault=verdict.fault)
+            # All of it fits, and the next frames may determine what it leaves open: the track goes on through it. But
+            # where images fit better without the motion that led there, that is what is wrong.
+            report = self._relocalise(new, verdict.fault, than=found)
+            if report.lost:
+                track.found.follow(self._accept(found, verdict))
+            return report
         if verdict.fault:
             return self._search(found, verdict.fault, gap, led)
         self._bridge.close(track)
@@ -154,17 +156,20 @@ class Tracker:
         return report
 
     def _relocalise(
-        self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None
+        self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None, than: Match | None = None
     ) -> FrameReport:  # fmt: skip
         """Find a frame again and go on with a new segment of the spline; what was reported before stays as it is.
 
         fault: why it is not where the motion led, if it was looked for there. T_led (4, 4): where an IMU led it.
+        than: what it has to explain better than that does.
         """
         track = self.track
         where = self._relocaliser.find(track, new, T_led)
         if isinstance(where, Fault):
             return track.report(new, fault=fault or where)
         found, verdict = where
+        if than is not None and not found.explains_more(than):
+            return track.report(new, fault=fault)
         # The new segment may need control points of the last frames before: their poses are stored, not their spline.
         track.found.begin_segment(track.known()[0].spline, found.window.state.untouched)
         new = self._accept(found, verdict)

@@ -107,16 +107,3 @@ def test_sigmas_are_too_small_by_as_much_as_images_pull_further_than_noise() -> 
     # Twelve numbers: χ² is about that.
     assert Scores((3.0, 2.0, nan)).excess == Scores().excess == 1.0
     assert Scores((1.0, 12.0, 5.0)).excess == pytest.approx(12.0 / np.sqrt(12.0))
-
-
-@pytest.mark.parametrize(("own", "share"), [(float("nan"), 1.0), (3.0, 1.0), (8.0, 0.5)])
-def test_an_image_whose_residuals_hang_together_more_than_others_tells_less(
-    own: float, share: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Others' are inflated by four. What the spline is moved by stays as it is."""
-    usual, one = sight(weight=1.0), sight(weight=0.25)
-    monkeypatch.setattr(Observation, "inflation", own)
-    found = scores([one], SplineState(TRUTH)).formal
-    monkeypatch.setattr(Observation, "inflation", 1.0)
-    np.testing.assert_allclose(found, share * 0.25 * scores([usual], SplineState(TRUTH)).formal, rtol=1e-9)
-    assert one.stands_for == 0.25
