@@ -72,14 +72,13 @@ def match(
     return found
 
 
-def judge_predicted(track: TrackState, found: Match, gap: float, young: bool, after_lost: bool) -> Verdict:
+def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) -> Verdict:
     """Whether a frame was found where the motion led; gap: s since the one before.
 
-    young: its segment of the spline has just begun, and predicts little: all of its images have to fit. So they have
-    after a frame that is lost (after_lost): depth alone slides along what is flat. A rolling reference moves with what
-    is aligned to it, and does not bind the two. A gyroscope sees how rows move within an image that vibrates, which the
-    filter does not. Under the wrong shutter all images are off. In these three cases no prediction is held against
-    them.
+    young: its segment of the spline has just begun, and predicts little: all of its images have to fit. A rolling
+    reference moves with what is aligned to it, and does not bind the two. A gyroscope sees how rows move within an
+    image that vibrates, which the filter does not. Under the wrong shutter all images are off. In these cases no
+    prediction is held against them.
     """
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
@@ -100,7 +99,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool, af
         fault = lost(on_reference, found.solved, found.ref.pixels)
         # Images that fit far worse than the last ones may show another place: that of the prediction is not known then.
         is_odd = track.scales.exceeded(on_reference)
-        if not fault and ((young and is_odd) or ((young or after_lost) and not found.whole)):
+        if young and not fault and (is_odd or not found.whole):
             fault = Fault.MISFIT
         if not rolls:
             seen = score.information

@@ -110,8 +110,7 @@ class Tracker:
         fresh = track.observe(new, ref) + ([] if anchor is None else track.observe(new, anchor))
         levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
         found = match(track, predict, new, ref, fresh, levels, track.succession.recent[-1].depth)
-        after_lost = not led and track.found.last < track.reports[-1].stamp
-        verdict = judge_predicted(track, found, gap, young, after_lost)
+        verdict = judge_predicted(track, found, gap, young)
         if verdict.fault is Fault.UNKNOWN and found.is_checked and not (verdict.is_odd or led):
             # All of it fits, and the next frames may determine what it leaves open: the track goes on through it. But
             # where images fit better without the motion that led there, that is what is wrong.
