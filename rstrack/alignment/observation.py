@@ -103,11 +103,6 @@ class Observation:
         return round(self.linearisation.stands_for * self.lin.count)
 
     @property
-    def scale(self) -> float:
-        """Of its residuals; depth's as it would be at one metre."""
-        return self.lin.next_sigma / (self.ref.median_depth**2 if self.is_depth else 1.0)
-
-    @property
     def inflation(self) -> float:
         """That of the linearisation, by pixels of the finest level; see `weights.inflation`."""
         return self.linearisation.stands_for * self.lin.inflation

@@ -29,14 +29,12 @@ from rstrack.tracking.window import Window
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """fault: why a frame has not been found. score: by its images; uncertainty, common: of it, if it has been. is_odd:
-    an image fits far worse than the last ones."""
+    """fault: why a frame has not been found. score: by its images; uncertainty, common: of it, if it has been."""
 
     fault: Fault
     score: Scores
     uncertainty: Uncertainty
     common: Common
-    is_odd: bool = False
 
 
 def match(
@@ -83,7 +81,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
     mid, rolls = new.depth.exposure.mid_time, is_rolling(found.ref)
-    T_predicted, seconds = found.predicted.pose(mid), new.stamp - track.found.last
+    T_predicted, seconds = found.predicted.pose(mid), new.stamp - track.found.stamps[-1]
     accelerations = track.accelerations(window, seconds, T_predicted[:3, :3])
     considered = track.covariances.considered(seconds)
     state = uncertainty.predicted(seconds, *accelerations)
@@ -125,7 +123,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
         track.scales.learn(on_reference)
         if implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.MOTION
-    return Verdict(fault or _unknown(uncertainty), score, uncertainty, common, is_odd)
+    return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
 
 
 def unfinished(solved: Solved, state: SplineState, t: float) -> FloatArray:

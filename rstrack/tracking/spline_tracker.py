@@ -111,13 +111,6 @@ class Tracker:
         levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
         found = match(track, predict, new, ref, fresh, levels, track.succession.recent[-1].depth)
         verdict = judge_predicted(track, found, gap, young)
-        if verdict.fault is Fault.UNKNOWN and found.is_checked and not (verdict.is_odd or led):
-            # All of it fits, and the next frames may determine what it leaves open: the track goes on through it. But
-            # where images fit better without the motion that led there, that is what is wrong.
-            report = self._relocalise(new, verdict.fault, than=found)
-            if report.lost:
-                track.found.follow(self._accept(found, verdict))
-            return report
         if verdict.fault:
             return self._search(found, verdict.fault, gap, led)
         self._bridge.close(track)
@@ -155,20 +148,17 @@ class Tracker:
         return report
 
     def _relocalise(
-        self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None, than: Match | None = None
+        self, new: DeviceFrame, fault: Fault = Fault.NONE, T_led: FloatArray | None = None
     ) -> FrameReport:  # fmt: skip
         """Find a frame again and go on with a new segment of the spline; what was reported before stays as it is.
 
         fault: why it is not where the motion led, if it was looked for there. T_led (4, 4): where an IMU led it.
-        than: what it has to explain better than that does.
         """
         track = self.track
         where = self._relocaliser.find(track, new, T_led)
         if isinstance(where, Fault):
             return track.report(new, fault=fault or where)
         found, verdict = where
-        if than is not None and not found.explains_more(than):
-            return track.report(new, fault=fault)
         # The new segment may need control points of the last frames before: their poses are stored, not their spline.
         track.found.begin_segment(track.known()[0].spline, found.window.state.untouched)
         new = self._accept(found, verdict)

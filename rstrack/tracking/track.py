@@ -65,23 +65,6 @@ class Match:
         """What the frame's images say against `ref`, not against other keyframes."""
         return [o for o in self.fresh if o.ref.index == self.ref.index]
 
-    @property
-    def is_checked(self) -> bool:
-        """Whether depth and colour both fit the reference: what one of them alone has found, nothing confirms."""
-        return self.whole and len(self.on_reference) > 1
-
-    def explains_more(self, other: Match) -> bool:
-        """Whether residuals of all images are smaller, and hang together less, than in another match of the frame."""
-
-        def key(o: Observation) -> tuple[bool, float]:
-            return o.is_depth, o.image.exposure.mid_time
-
-        own = {key(o): o for o in self.on_reference if o.is_linearised}
-        return all(
-            (one := own.get(key(o))) is not None and one.scale <= o.scale and one.inflation <= o.inflation
-            for o in other.on_reference
-        )
-
     def again(self) -> None:
         """Align at full size from where it is: its observations count otherwise now, or its steps went to and fro.
 

@@ -227,23 +227,21 @@ def _pose_prior(ref: Reference) -> Prior:
 class FoundPoses:
     """stamps: of the frames that were found. valid: times (begin, end) in s within which the spline is an estimate.
 
-    last, end: stamp and end (s) of the last frame that the spline follows, whether its pose is known or not.
     Poses of the first frames are stored here once nothing moves them; the others are the spline's.
     """
 
     def __init__(self) -> None:
         self.stamps: list[float] = []
         self.valid: list[tuple[float, float]] = []
-        self.last = self.end = -np.inf
         self._settled = PointStore()
 
-    def follow(self, new: DeviceFrame) -> None:
-        """The spline goes on to a frame."""
-        self.last, self.end = new.stamp, new.last_time
+    @property
+    def end(self) -> float:
+        """Time (s) until which the spline is known."""
+        return self.valid[-1][1]
 
     def add(self, new: DeviceFrame, joined: bool = True) -> None:
         """A frame that has been found; joined: to the frames before it, not with a segment of its own."""
-        self.follow(new)
         self.stamps.append(new.stamp)
         begin = min(new.first_time, new.stamp)
         if joined and self.valid:

@@ -47,15 +47,19 @@ class RunningScales:
     def learn(self, fresh: Sequence[Observation]) -> None:
         """A frame has been found."""
         for o in fresh:
-            (self._depth if o.is_depth else self._color).append(o.scale)
+            if o.is_depth:
+                self._depth.append(o.lin.next_sigma / o.ref.median_depth**2)
+            else:
+                self._color.append(o.lin.next_sigma)
 
     def exceeded(self, fresh: Sequence[Observation]) -> bool:
         """Whether an image of a frame fits worse than the last ones did; never where no scale is known."""
-        return any(o.scale > self._most(o) for o in fresh)
+        return any(o.lin.next_sigma > self._most(o) for o in fresh)
 
     def _most(self, o: Observation) -> float:
         last, harmless = (self._depth, _HARMLESS_DEPTH) if o.is_depth else (self._color, _HARMLESS_INTENSITY)
-        return max(harmless, _GROWTH * median(last)) if last else np.inf
+        distance = o.ref.median_depth if o.is_depth else 1.0
+        return distance**2 * max(harmless, _GROWTH * median(last)) if last else np.inf
 
 
 def misfits(fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from rsgen.geometry import se3
-from rstrack.alignment.observation import Observation
 from rstrack.alignment.optimizer import Solved
 from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.judgement.lost_track import RunningScales, implausible, is_hopeless, is_settled, lost, misfits
@@ -25,9 +24,7 @@ def term(
     what colours are expected to differ by."""
     lin = SimpleNamespace(count=count, next_sigma=sigma, fit=fit, contrast=contrast)
     ref = SimpleNamespace(median_depth=distance)
-    made = SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=ref)
-    made.scale = Observation.scale.fget(made)  # type: ignore[attr-defined]
-    return made
+    return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=count, ref=ref)
 
 
 def fault(terms: Iterable[Any], shift: float = 0.05, expected: int = 5000) -> str:

@@ -20,9 +20,7 @@ from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Method, Options
 from rstrack.tracking import bootstrap
 from rstrack.tracking.frame_report import Fault
-from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.spline_tracker import Tracker
-from rstrack.tracking.track import Match
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 ROLLING, GLOBAL = Shutter(readout_s=0.028), Shutter()
@@ -230,22 +228,6 @@ def test_where_an_image_fits_far_worse_than_usual_the_motion_before_does_not_mak
         z, color = at_a_wall(k, is_odd and k == 11)
         report = tracker.feed(Frame(Image(k / 30, z), () if k == 11 else (Image(k / 30, color),)))
         assert report.lost == (k == 11 and is_odd), (k, report.fault)
-
-
-@pytest.mark.parametrize("explains", [False, True])
-def test_a_frame_that_fits_and_leaves_its_pose_open_is_lost_and_followed_unless_it_fits_better_elsewhere(
-    explains: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Match, "explains_more", lambda *_: explains)
-    tracker = tracker_of("rs-pg")
-    for k in range(20):
-        # Not known where the motion leads; looked for at a keyframe it is.
-        known = iter([False, True] if 12 <= k < 15 else [])
-        monkeypatch.setattr(Uncertainty, "is_known", property(lambda _, known=known: next(known, True)))
-        tracker.feed(frame_at(k))
-        assert tracker.track.found.last == k / 30.0 and tracker.reports[k].lost == (12 <= k < 15 and not explains)
-    assert {tracker.reports[k].fault for k in range(12, 15)} == {Fault.NONE if explains else Fault.UNKNOWN}
-    assert (len(tracker.spline_valid) > 1) == explains and worst_step(tracker) < 3e-3
 
 
 def test_nothing_but_blank_frames() -> None:
