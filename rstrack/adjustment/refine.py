@@ -196,17 +196,17 @@ class Refiner:
             usual = self._usual(o)
             o.independent = 1.0 / self._inflations[not o.is_depth]
             o.begin(usual)
-            before = o.brightness(state)
+            before = o.nuisance(state)
             for _ in range(_LOOKS):
                 o.linearise(self.terms, state, 0)
-                if o.is_depth or (np.abs(o.brightness(state) - before) < _BRIGHTER).all():
+                if o.is_depth or (np.abs(o.nuisance(state) - before) < _BRIGHTER).all():
                     break
-                before = o.brightness(state)
+                before = o.nuisance(state)
             sees = o.pixels >= _LEAST_SHARE * ref.pixels and o.lin.fit >= _LEAST_FIT
             if sees and o.lin.next_sigma < _WORST * usual:
                 good.append(o)
                 if not o.is_depth:
-                    self._brightness[ref.index] = o.brightness(state)
+                    self._brightness[ref.index] = o.nuisance(state)
         return good
 
     def _model(self, o: Observation, state: SplineState, frame: DeviceFrame) -> Quadratic:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.alignment.normal_equations import Eliminated
 
 MID_GREY = 0.5
 """Intensity about which the gain turns: gain and offset are then least correlated."""
@@ -25,9 +24,9 @@ SAME = np.zeros(2)
 """As bright as the reference."""
 
 
-def best(at: FloatArray, found: Eliminated, increments: FloatArray) -> FloatArray:
-    """Gain and offset (2,) that were eliminated `at` (2,), after increments (6k,) of the control points."""
-    return np.clip(at + found.step + found.follow @ increments, _LEAST, _MOST)
+def credible(found: FloatArray) -> FloatArray:
+    """Gain and offset (2,), no further from none than a camera's can be."""
+    return np.clip(found, _LEAST, _MOST)
 
 
 def contrast(H: FloatArray, at: FloatArray) -> float:

@@ -7,7 +7,7 @@ is eliminated, and σ is estimated anew.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,7 +23,7 @@ from rstrack.alignment.brightness import SAME, SIGMA, contrast
 from rstrack.alignment.normal_equations import Eliminated, Quadratic, Slopes, chain, eliminate
 from rstrack.alignment.pace import Pace
 from rstrack.alignment.residuals import (
-    WHOLE,
+    LEVEL,
     GeometricInput,
     PhotometricInput,
     VisibilityInput,
@@ -56,9 +56,9 @@ class Linearised:
     """A term around a state: `model` divided by σ², and the sums over blocks of lines from which it was made.
 
     motion (n, 6, 6k): derivative of the blocks' twists by the model's control points. cost: of the pixels' weights and
-    the brightness's prior. floor: smallest credible σ of this camera and reference. median_depth (m): of the points.
-    brightness: a colour image's gain and offset, eliminated from the model. contrast: see `brightness.contrast`;
-    infinite for depth.
+    the nuisances' prior. floor: smallest credible σ of this camera and reference. median_depth (m): of the points.
+    nuisance: a colour image's gain and offset, or a depth image's offset and tilts, eliminated from the model.
+    contrast: see `brightness.contrast`; infinite for depth.
     """
 
     model: Quadratic
@@ -69,7 +69,7 @@ class Linearised:
     floor: float
     median_depth: float
     sums: BlockSums
-    brightness: Eliminated | None = None
+    nuisance: Eliminated | None = None
     contrast: float = np.inf
 
     @property
@@ -158,9 +158,11 @@ class Terms:
 
     def geometric(
         self, image: DepthImage, ref: Reference, spline: Spline, level: int, sigma: float,
-        slopes_at: Spline | None = None,
+        slopes_at: Spline | None = None, whole: FloatArray = LEVEL,
     ) -> Started:  # fmt: skip
         """Depth image against the reference's depth with the pixels of a level (`strides`), or `THINNED`.
+
+        whole (3,): what it is off by as a whole here, in units of `whole_image_unit`.
 
         slopes_at: spline at which the lines' poses are differentiated by control points, if not `spline`: that changes
         by no more than the increments between the two (relative), which Gauss-Newton steps do not notice.
@@ -177,15 +179,17 @@ class Terms:
             larger = max(1.0, _FINE_FOCAL / ref.lens.camera.fx) ** 2
             smooth = self.smooth * max(sigma, FLOOR_DEPTH * larger)
             rough = min(1.0, larger - 1.0) if self.counts_rough else 0.0
-            constants = e.upload(scaling.parameters(sigma, gate, smooth, rough))
+            off = whole * whole_image_unit(ref.median_depth)
+            constants = e.upload(scaling.parameters(sigma, gate, smooth, rough, *off))
             surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness
             raw = kernel(GeometricInput(image.z, *self.rays, poses[0], *surface, poses[1], constants))
         slopes = self._slopes(slopes_at or spline, image.exposure, ref)
 
         def finish() -> Linearised:
             with self.timer(f"geometric kernel, level {level}"):
-                sums = scaling.unpack(raw.numpy(), *block_counts(lens, ref.lens)[:2], WHOLE if shifts else 0)
-                return self._finish(sums, slopes, sigma, floor, ref.median_depth)
+                sums = scaling.unpack(raw.numpy(), *block_counts(lens, ref.lens)[:2], len(whole) if shifts else 0)
+                prior = np.full(len(whole), self.depth_image / whole_image_unit(ref.median_depth))
+                return self._finish(sums, slopes, sigma, floor, ref.median_depth, whole, prior)
 
         return finish
 
@@ -224,8 +228,9 @@ class Terms:
         def finish() -> Linearised:
             with self.timer(f"photometric kernel, level {level}"):
                 sums = scaling.unpack(raw.numpy(), *block_counts(lens, ref.lens)[:2], len(brightness))
-                floor, median_depth = self.floor_intensity, points.median_depth
-                return self._finish(sums, slopes, sigma, floor, median_depth, brightness, expected)
+                floor, median_depth, off = self.floor_intensity, points.median_depth, brightness - expected
+                done = self._finish(sums, slopes, sigma, floor, median_depth, off, SIGMA)
+                return done if sums.columns is None else replace(done, contrast=contrast(sums.columns.H, brightness))
 
         return finish
 
@@ -254,27 +259,22 @@ class Terms:
 
     def _finish(
         self, sums: BlockSums, slopes: Slopes, sigma: float, floor: float, median_depth: float,
-        brightness: FloatArray | None = None, expected: FloatArray = SAME,
+        off: FloatArray, prior: FloatArray,
     ) -> Linearised:  # fmt: skip
+        """off: how far the nuisances are from what they are expected to be; prior: σ of that."""
         # Lines that are exposed at once move alike.
         moved = sums.summed() if len(sums.H) > len(slopes.current) else sums
         with self.timer("linear algebra: chain"):
             own = moved.columns
             model, coupling = chain(moved, slopes, None if own is None else own.coupling)
-        H, g, cost, found, spread = model.H / sigma**2, model.g / sigma, sums.cost, None, np.inf
+        H, g, cost, left = model.H / sigma**2, model.g / sigma, sums.cost, None
         if own is not None:
-            scaled = H, g, coupling / sigma**2, own.H / sigma**2, own.g / sigma
-            if brightness is None:
-                prior = np.full(WHOLE, self.depth_image / whole_image_unit(median_depth))
-                left = eliminate(*scaled, prior, np.zeros(WHOLE))
-            else:
-                spread, off = contrast(own.H, brightness), brightness - expected
-                left = found = eliminate(*scaled, SIGMA, off)
-                cost += 0.5 * float(np.sum((off / SIGMA) ** 2))
+            left = eliminate(H, g, coupling / sigma**2, own.H / sigma**2, own.g / sigma, prior, off)
+            cost += 0.5 * float(np.sum((off / prior) ** 2))
             H, g = left.H, left.g
         next_sigma = scale_step(sigma, sums.weighted, sums.count, floor)
         model = Quadratic(model.first, H, g)
-        return Linearised(model, slopes.current, sigma, next_sigma, cost, floor, median_depth, sums, found, spread)
+        return Linearised(model, slopes.current, sigma, next_sigma, cost, floor, median_depth, sums, left)
 
 
 def _block_times(exposure: Exposure, ref: Reference) -> FloatArray:

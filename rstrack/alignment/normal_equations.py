@@ -118,6 +118,11 @@ class Eliminated:
     step: FloatArray
     follow: FloatArray
 
+    def after(self, at: FloatArray, increments: FloatArray) -> FloatArray:
+        """Those (n,) that were eliminated `at` (n,), after increments (m,) of the others."""
+        found: FloatArray = at + self.step + self.follow @ increments
+        return found
+
 
 def eliminate(
     H: FloatArray, g: FloatArray, coupling: FloatArray, own: FloatArray, own_g: FloatArray, sigma: FloatArray,

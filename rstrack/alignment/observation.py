@@ -13,9 +13,10 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.brightness import SAME, best
+from rstrack.alignment.brightness import SAME, credible
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic, block_diagonal
+from rstrack.alignment.residuals import LEVEL
 from rstrack.alignment.spline_state import SplineState
 from rstrack.alignment.weights import START_DEPTH, START_INTENSITY
 from rstrack.compiled import compiled
@@ -41,14 +42,14 @@ class _Linearisation:
 
     at: increments (k, 6) that the model's control points had received when it was made. stands_for: pixels of the
     finest level for each.
-    brightness: gain and offset (2,) of a colour image there.
+    nuisance: see `Observation.nuisance`, there.
     """
 
     lin: Linearised | None = None
     sigma: float = 0.0
     at: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
     stands_for: float = 1.0
-    brightness: FloatArray | None = None
+    nuisance: FloatArray | None = None
 
 
 class _Now(NamedTuple):
@@ -131,7 +132,7 @@ class Observation:
     def restart(self, state: SplineState, keep_sigma: bool) -> None:
         """Begin anew, as at a new level of the pyramid."""
         sigma = self.linearisation.sigma if keep_sigma else 0.0
-        self.linearisation = _Linearisation(sigma=sigma, brightness=self.brightness(state))
+        self.linearisation = _Linearisation(sigma=sigma, nuisance=self.nuisance(state))
 
     def linearise(self, terms: Terms, state: SplineState, level: int) -> None:
         """Around the current state; takes the σ that the one before suggested."""
@@ -142,9 +143,10 @@ class Observation:
         image, sigma, slopes_at = self.image, self.linearisation.sigma, self.slopes_at(state)
         is_finest = level == 0
         level = THINNED if is_finest and self.independent < THIN_BELOW else level
-        brightness, before = self.brightness(state), state.copy()
+        nuisance, before = self.nuisance(state), state.copy()
         if isinstance(image, DepthImage):
-            started = terms.geometric(image, self.ref, state.spline, level, sigma or START_DEPTH, slopes_at)
+            sigma = sigma or START_DEPTH
+            started = terms.geometric(image, self.ref, state.spline, level, sigma, slopes_at, nuisance)
         else:
             if is_finest and self._visible is None and self.occluder is not None:
                 # Once: the coarse levels have brought the poses close enough, and a fixed set converges.
@@ -152,7 +154,7 @@ class Observation:
             visible = self._visible if is_finest else None
             sigma = sigma or START_INTENSITY
             started = terms.photometric(
-                image, self.ref, state.spline, level, sigma, slopes_at, visible, brightness, self.expected
+                image, self.ref, state.spline, level, sigma, slopes_at, visible, nuisance, self.expected
             )
         # A coarse level's pixels stand for those left out: the priors' share must not depend on the level.
         stands_for = 4.0 ** (1 if level == THINNED else level)
@@ -160,23 +162,30 @@ class Observation:
         def finish() -> None:
             lin = started()
             at = before.received(lin.model.first, lin.model.last)
-            self.linearisation = _Linearisation(lin, lin.next_sigma, at, stands_for, brightness)
+            self.linearisation = _Linearisation(lin, lin.next_sigma, at, stands_for, nuisance)
 
         return finish
 
-    def brightness(self, state: SplineState) -> FloatArray:
-        """Gain and offset (2,) of a colour image in the current state; at first those expected."""
-        lin, before = self.linearisation.lin, self.linearisation.brightness
-        if before is None or lin is None or lin.brightness is None:
-            return self.expected if before is None else before
-        return best(before, lin.brightness, self._since(state).ravel())
+    def nuisance(self, state: SplineState) -> FloatArray:
+        """What else is unknown of the image, in the current state; at first as expected.
+
+        Gain and offset (2,) of a colour image; what a depth image is off by as a whole (3,), see `whole_image`.
+        """
+        lin, before = self.linearisation.lin, self.linearisation.nuisance
+        if before is None:
+            return LEVEL if self.is_depth else self.expected
+        if lin is None or lin.nuisance is None:
+            return before
+        found = lin.nuisance.after(before, self._since(state).ravel())
+        return found if self.is_depth else credible(found)
 
     def shift(self, state: SplineState, focal: float) -> float:
         """Pixels that the lines have moved since the linearisation; infinite where the brightness has changed too."""
-        lin, before = self.linearisation.lin, self.linearisation.brightness
+        lin, before = self.linearisation.lin, self.linearisation.nuisance
         if lin is None:
             return np.inf
-        if before is not None and (np.abs(self.brightness(state) - before) > _SAME * lin.sigma).any():
+        changed = 0.0 if self.is_depth or before is None else float(np.abs(self.nuisance(state) - before).max())
+        if changed > _SAME * lin.sigma:
             return np.inf
         return lin.row_shift(self._since(state), focal, self.ref.median_depth)
 

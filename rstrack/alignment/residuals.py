@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from rsgen.device.arrays import Engine, recorded_with
 from rsgen.device.lens import Lens, per_focal
@@ -45,8 +46,8 @@ from rstrack.images.sampling import (
     value_and_slope,
 )
 
-WHOLE = 3
-"""Unknowns of a depth image as a whole: offset and two tilts of its inverse depth."""
+LEVEL = np.zeros(3)
+"""A depth image that is not off as a whole: offset and two tilts of its inverse depth."""
 # Length of a ray, z being 1, times its x or y: of pixels 60° off the axis.
 _WIDEST = 4.0
 
@@ -57,7 +58,8 @@ class GeometricInput:
 
     depth (m), rays_* (normalised), to_base: of the current image's pixels and lines. inverse_depth, slope_* (smoothed,
     for normals), roughness (m), from_base: of the reference. constants: those of `Scaling`; the roughness beyond which
-    a pixel of the reference is not smooth; and 0 to leave such out, 1 to weigh them by its inverse fourth power.
+    a pixel of the reference is not smooth; 0 to leave such out, 1 to weigh them by its inverse fourth power; and the
+    offset and tilts (1/m) that the image's inverse depth has now.
     """
 
     depth: Any
@@ -80,8 +82,7 @@ def geometric_kernel(
     lens, ref_lens: the current depth camera's and the reference's, whose frame is the base if it is rectified. shifts:
     with the columns of `whole_image`.
     """
-    count = WHOLE if shifts else 0
-
+    count = len(LEVEL) if shifts else 0
     size, down = room(lens, ref_lens, count), lens.rolls and not lens.shutter.by_rows
     runs, own_blocks = Runs.over(e, lens.camera.width, lens.camera.height, stride, down), Blocks.of(lens, ref_lens)
 
@@ -95,6 +96,9 @@ def geometric_kernel(
             active = pixels.meant & (z > 0.0)
             even = evened(z, parameters[2])
             xn, yn = (dr.gather(e.Float, ray, pixels.index) for ray in (given.rays_x, given.rays_y))
+            if shifts:
+                offset, by_x, by_y = (dr.gather(e.Float, given.constants, e.UInt(i)) for i in (9, 10, 11))
+                z *= dr.rcp(dr.fma(z, dr.fma(by_x, xn, dr.fma(by_y, yn, offset)), 1.0))
             line = row_of_pixel(e, lens, pixels.x, pixels.y)
             to_base = gather(given.to_base, line, TO_BASE, stride=TO_BASE)
             p = move(to_base, (xn * z, yn * z, z))

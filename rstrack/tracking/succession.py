@@ -59,7 +59,7 @@ class Gains:
         color = next((o for o in fresh if not o.is_depth), None)
         own = brightness.SAME
         if color is not None:
-            own = brightness.absolute(color.brightness(state), color.ref.brightness)
+            own = brightness.absolute(color.nuisance(state), color.ref.brightness)
         self.found = {k: b for k, b in self.found.items() if k >= oldest} | {frame.index: own}
         self.moments = frame.colors[0].moments
 

@@ -202,7 +202,7 @@ def _found(
         return nothing
     color = next((o for o in own if not o.is_depth), None)
     sigma_depth = next((o.lin.next_sigma for o in own if o.is_depth), START_DEPTH)
-    image, brightness = (color.image, color.brightness(state)) if color else (None, SAME)
+    image, brightness = (color.image, color.nuisance(state)) if color else (None, SAME)
     assert not isinstance(image, DepthImage)
     e, scales = space.device.e, (sigma_depth, ref.median_depth)
     sigma_intensity = color.lin.next_sigma if color else np.inf

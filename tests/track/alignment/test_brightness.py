@@ -27,7 +27,7 @@ def test_what_is_eliminated_is_what_a_joint_solution_gives() -> None:
     left = eliminate(H[:12, :12], g[:12], H[:12, 12:], H[12:, 12:], g[12:], brightness.SIGMA, at - expected)
     np.testing.assert_allclose(-np.linalg.solve(left.H, left.g), x[:12], rtol=1e-8)
     np.testing.assert_allclose(left.step + left.follow @ x[:12], x[12:], rtol=1e-8)
-    np.testing.assert_allclose(brightness.best(at, left, 1e-3 * x[:12]), at + left.step + 1e-3 * left.follow @ x[:12])
+    np.testing.assert_allclose(left.after(at, x[:12]), at + x[12:], rtol=1e-8)
 
 
 def brighter(image: ColorImage, gain: float, offset: float) -> ColorImage:
@@ -44,8 +44,8 @@ def test_gain_and_offset_of_an_image_are_found(gain: float, offset: float, ref_s
         # The prior is centred on the truth, so that it does not pull; the start is not.
         known = np.array([gain, offset])
         lin = s.terms.photometric(image, s.ref, s.truth, 0, sigma, brightness=at, expected=known)()
-        assert lin.brightness is not None
-        at, sigma = brightness.best(at, lin.brightness, np.zeros(len(lin.model.g))), lin.next_sigma
+        assert lin.nuisance is not None
+        at, sigma = lin.nuisance.after(at, np.zeros(len(lin.model.g))), lin.next_sigma
     # Interpolation of such small images leaves errors of 2e-4 in intensity, which the gain takes for contrast.
     np.testing.assert_allclose(at, [gain, offset], atol=3e-3)
 

@@ -29,7 +29,9 @@ from rstrack.alignment import block_sums, linearise
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic
+from rstrack.alignment.observation import Observation
 from rstrack.alignment.residuals import whole_image_unit
+from rstrack.alignment.spline_state import SplineState
 from rstrack.images import line_poses as lines
 from rstrack.images.pyramid import ColorImage, DepthImage, depth_image
 
@@ -206,6 +208,27 @@ def test_what_a_depth_image_is_off_by_as_a_whole_is_no_part_of_the_model(off_by:
     assert lin.cost == plain.cost
     lost = np.linalg.norm(plain.model.H - lin.model.H) / np.linalg.norm(plain.model.H)
     assert lost < 1e-6 if off_by == 1e-9 else lost > 0.1
+
+
+def test_where_a_depth_image_is_off_as_a_whole_its_model_tells_how_its_cost_changes() -> None:
+    truth, image = synthetic.make_spline(), exposure(0.30, "top-bottom", DEPTH)
+    z, rays = depth_of(synthetic.cast, truth, image), DEPTH.unproject(DEPTH.pixel_grid())
+    bent = np.where(z > 0, z / (1.0 + z * (4e-3 + 6e-3 * rays[..., 0] - 4e-3 * rays[..., 1])), 0.0)
+    ref = exact_reference(synthetic.cast, truth, exposure(0.25, None))
+    terms = Terms(ENGINE, maker(DEPTH).device_rays, depth_image=0.01)
+    o, state = Observation(0, depth_image(ENGINE, image, bent, 100.0), ref), SplineState(truth)
+    for _ in range(15):
+        o.linearise(terms, state, 0)
+    off = o.nuisance(state) * whole_image_unit(ref.median_depth)
+    np.testing.assert_allclose(off, [-4e-3, -6e-3, 4e-3], atol=1e-4)
+    costs = []
+    for step in (0.0, 2e-3):
+        o.linearisation = replace(o.linearisation, sigma=0.02)
+        state.apply(0, step * np.random.default_rng(4).normal(size=(len(state.points), 6)))
+        expected = o.change(state)
+        o.linearise(terms, state, 0)
+        costs.append(o.lin.cost)
+    assert costs[1] - costs[0] == pytest.approx(expected, rel=0.1) and expected > 1.0
 
 
 # -- gates, floors and what is left out -----------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from rstrack_util import (
     small_camera,
 )
 
+from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
@@ -154,18 +155,18 @@ def test_sums_equal_those_of_a_loop_over_pixels(room: tuple, monkeypatch: pytest
 
 def block_sums(
     image: DepthImage, ref: Reference, spline: Spline, gate: float, sigma: float, roughness: float = np.inf,
-    coarse: float = 1.0, shifts: bool = False,
+    coarse: float = 1.0, shifts: bool = False, whole: FloatArray = residuals.LEVEL,
 ) -> BlockSums:  # fmt: skip
     """The kernel itself, with a gate of one's own."""
     kernel = residuals.geometric_kernel(ENGINE, image.exposure.lens, ref.lens, 2, shifts)
     camera = image.exposure.lens.camera
     scaling = Scaling(ref.median_depth, ref.bound, camera.width * camera.height // 4)
     to_base = ENGINE.upload(to_base_table(spline, ref.T_world_base, image.exposure))
-    constants = ENGINE.upload(np.append(scaling.parameters(sigma, gate), [roughness, coarse]))
+    constants = ENGINE.upload(np.append(scaling.parameters(sigma, gate), [roughness, coarse, *whole]))
     surface = ref.inverse_depth, ref.slope_x, ref.slope_y, ref.roughness, ENGINE.upload(IDENTITY_FROM_BASE)
     raw = kernel(residuals.GeometricInput(image.z, *maker(DEPTH).device_rays, to_base, *surface, constants))
     current, reference, _, _ = block_counts(image.exposure.lens, ref.lens)
-    return scaling.unpack(raw.numpy(), current, reference, residuals.WHOLE if shifts else 0)
+    return scaling.unpack(raw.numpy(), current, reference, len(whole) if shifts else 0)
 
 
 def test_what_an_image_is_off_by_as_a_whole_is_what_its_columns_say(room: tuple) -> None:
@@ -183,6 +184,22 @@ def test_what_an_image_is_off_by_as_a_whole_is_what_its_columns_say(room: tuple)
 
     for off in 2e-3 * np.eye(3):
         np.testing.assert_allclose(0.5 * (found(-off) - found(off)), off, atol=6e-5)
+
+
+def test_what_an_image_is_off_by_as_a_whole_is_taken_off(room: tuple) -> None:
+    as_input, ref, _, z = room
+    x, y = np.moveaxis(DEPTH.unproject(DEPTH.pixel_grid())[..., :2], -1, 0)
+    off = np.array([5e-3, 0.02, -0.01])
+    rho = np.divide(1.0, z, out=np.zeros_like(z), where=z > 0)
+    bent = np.where(z > 0, rho - off[0] - off[1] * x - off[2] * y, 0.0)
+    image = as_input(np.divide(1.0, bent, out=np.zeros_like(z), where=z > 0).astype(np.float32))
+
+    def cost(image: DepthImage, whole: np.ndarray) -> float:
+        return block_sums(image, ref, synthetic.make_spline(), 10.0, 0.01, shifts=True, whole=whole).cost
+
+    straight, wrong, put_right = cost(as_input(z), 0.0 * off), cost(image, 0.0 * off), cost(image, off)
+    assert wrong > 2.0 * straight and put_right - straight < 0.05 * (wrong - straight)
+    assert put_right == pytest.approx(straight, rel=0.1)
 
 
 def test_further_columns_change_no_other_sum(room: tuple) -> None:
