@@ -168,7 +168,7 @@ def starts(full: Records) -> list[str]:
         mark = "†" if any(record.total("lost") for record in mine) else ""
         found = f"{significant(geometric_mean(errors))}{mark} ({significant(max(errors))})" if errors else "lost"
         parts.append(f"`{sequence}` {found}")
-    text = "Begun at three to five frames of each, `rs-pg`, ATE in mm, geometric mean (worst): " + ", ".join(parts)
+    text = "Begun at three to nine frames of each, `rs-pg`, ATE in mm, geometric mean (worst): " + ", ".join(parts)
     return [text + ".", ""] if parts else []
 
 
