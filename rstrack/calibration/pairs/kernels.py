@@ -159,9 +159,14 @@ def in_atlas(view: Any, width: Any, height: Any, x: Any, y: Any) -> tuple[Any, A
     return x + type(x)(view % ACROSS * width), y + type(y)(view // ACROSS * height)
 
 
-def _inside(width: Any, height: Any, margin: float, x: Any, y: Any) -> Any:
-    """Whether all that is interpolated between lies in one image, and not in the atlas's next."""
-    return (x >= margin) & (y >= margin) & (x < width - 1.0 - margin) & (y < height - 1.0 - margin)
+def _inside(view: Any, width: Any, height: Any, margin: float, x: Any, y: Any) -> Any:
+    """Whether all that is interpolated between at (x, y) of the atlas is of a view's image, and not of the next one.
+
+    Not before they are in the atlas: the sum is rounded, and may lie across an image's edge, or beyond the last one's.
+    """
+    left, top = in_atlas(view, width, height, type(x)(0.0), type(y)(0.0))
+    right, bottom = left + (width - 1.0), top + (height - 1.0)
+    return (x >= left + margin) & (y >= top + margin) & (x < right - margin) & (y < bottom - margin)
 
 
 @dataclass(frozen=True)
@@ -190,8 +195,8 @@ def depth_residual(
     at = _points(e, depth, compared, pixels, pixels.current, asked, given)
     first = pixels.reference * depth.lines
     seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, first)
-    active = at.active & seen.valid & _inside(width, height, 0.0, seen.x, seen.y)
     x, y = in_atlas(pixels.reference, width, height, seen.x, seen.y)
+    active = at.active & seen.valid & _inside(pixels.reference, width, height, 0.0, x, y)
     assert isinstance(lens.camera, TracedCamera)
     atlas = lens.camera.wider(ACROSS)
     rho, active = surface(e, atlas, given.inverse_depth, x, y, active)
@@ -233,9 +238,8 @@ def color_residual(
 
     def looked_up(view: Any, active: Any) -> tuple[RollingProjection, Any, Vector, Any]:
         seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, view * color.lines)
-        x, y = seen.x * shrink, seen.y * shrink
-        active = active & seen.valid & _inside(width, height, 1.0, x, y)
-        x, y = in_atlas(view, width, height, x, y)
+        x, y = in_atlas(view, width, height, seen.x * shrink, seen.y * shrink)
+        active = active & seen.valid & _inside(view, width, height, 1.0, x, y)
         # As high as any: where the image ends has been looked at.
         value, dx, dy, active = cubic_value_and_slope(e, given.image, ACROSS * width, ACROSS * height, x, y, active)
         return seen, value, seen.chain(dx * shrink, dy * shrink, 0.0), active

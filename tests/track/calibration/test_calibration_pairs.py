@@ -14,8 +14,9 @@ from rsgen.device.arrays import engine
 from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.normal_equations import eliminate
 from rstrack.alignment.weights import START_INTENSITY
+from rstrack.calibration.pairs import kernels
 from rstrack.calibration.pairs.chain import PairSums, add_system, without_brightness
-from rstrack.calibration.pairs.images import LinePoses, lines_of
+from rstrack.calibration.pairs.images import ACROSS, LinePoses, lines_of
 from rstrack.calibration.pairs.terms import PairTerms, pair_terms
 from rstrack.calibration.pairs.window import partners
 from rstrack.calibration.parameters import COUNT, NAMES
@@ -147,3 +148,16 @@ def test_views_so_many_frames_apart_are_compared_once() -> None:
     pairs = partners(20, (1, 4, 9, 16))
     assert len(pairs) == 50 == len({frozenset(pair) for pair in pairs.tolist()})
     assert set(np.abs(np.diff(pairs, axis=1)).ravel().tolist()) == {1, 4, 9, 16}
+
+
+def test_no_pixel_of_the_atlas_next_image_is_read() -> None:
+    e, width, height, view = engine("llvm"), 160, 120, 29
+    left, top = view % ACROSS * width, view // ACROSS * height
+    for x, y in ((width - 2, 60.5), (80.5, height - 2)):
+        # Just before the last four pixels; in the atlas it is rounded to the first place that is beyond them.
+        before = (e.Float(np.nextafter(np.float32(v), np.float32(0.0))) for v in (x, y))
+        at = kernels.in_atlas(e.UInt(view), width, height, *before)
+        assert float(at[0][0]) == left + x and float(at[1][0]) == top + y
+        assert not kernels._inside(e.UInt(view), width, height, 1.0, *at)[0]
+        well_before = kernels.in_atlas(e.UInt(view), width, height, e.Float(x - 1.0), e.Float(y - 1.0))
+        assert kernels._inside(e.UInt(view), width, height, 1.0, *well_before)[0]
