@@ -19,9 +19,8 @@ from rsgen.image_codecs import encode_exr
 from rsgen.light.quality import estimated_quality
 from rsgen.light.sampling import in_channels
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.images import ColorRenderer
+from rsgen.render.images import ColorRenderer, PixelSamples
 from rsgen.render.irradiance import make_field
-from rsgen.render.pixel_samples import PixelSamples
 
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 

@@ -14,9 +14,8 @@ from scipy.stats import qmc
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.images import ColorRenderer
+from rsgen.render.images import ColorRenderer, PixelSamples
 from rsgen.render.irradiance import make_field
-from rsgen.render.pixel_samples import PixelSamples
 
 LOOK_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 LOOK_DOWN[:3, 3] = 0.1, 0.0, 1.4
