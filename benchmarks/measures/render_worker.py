@@ -54,7 +54,7 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
         raise UserError("light.mode is 'path': what is measured is baked light")
     view_camera(config, settings["width"])  # a wrong width would else be reported after the bake
     mi = mitsuba(config.backend)
-    from rsgen.light.cache import baked_field
+    from rsgen.light.bake import baked_field
     from rsgen.light.lamps import straight_through_bulbs
     from rsgen.light.quality import estimated_quality
     from rsgen.render.baked import BakedIntegrator

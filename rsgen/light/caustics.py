@@ -24,7 +24,7 @@ from rsgen.light.sampling import CHANNELS, about_normal, in_channels, rotation, 
 from rsgen.light.specular_paths import SPECULAR, casts_caustics, caustic_radiance, transmitted
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import at_triangles, registry_id
-from rsgen.scene.meshes import mesh_arrays
+from rsgen.scene.meshes import mesh_corners, meshes_of
 
 # Where photons land, the normals of the sides they land on, (n, 3) each, and what each brings, W: (n, CHANNELS).
 Photons = tuple[NDArray, NDArray, NDArray]
@@ -46,7 +46,7 @@ def caustic_light(
     area (n,): of the surface that each stands for, m². samples: of each lamp at a point, which photons go by. follow:
     whether lamps shine through panes.
     """
-    shapes = [shape for shape in scene.shapes() if shape.is_mesh() and casts_caustics(shape)]
+    shapes = [shape for shape in meshes_of(scene) if casts_caustics(shape)]
     if not shapes:
         return np.zeros((len(which), CHANNELS), np.float32)
     # Whatever pieces of surface there are: where these are small, next to nothing would land on each.
@@ -109,11 +109,10 @@ def gathered_caustics(scene: Any, points: SamplePoints, which: IntArray, samples
 
 def _photons(scene: Any, shapes: list[Any], photons: int, follow: bool) -> Iterator[Photons]:
     """Yields what lands of so many photons that start from lit places on `shapes`, a batch and a turn at a time."""
-    meshes = [mesh_arrays(shape) for shape in shapes]
-    corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
-    face = np.concatenate([np.arange(len(faces), dtype=np.uint32) for _, faces in meshes])
-    of = np.repeat(np.array([registry_id(s) for s in shapes], np.uint32), [len(faces) for _, faces in meshes])
-    growing = np.cumsum(trimesh.triangles.area(corners))
+    corners = [mesh_corners(shape) for shape in shapes]
+    face = np.concatenate([np.arange(len(own), dtype=np.uint32) for own in corners])
+    of = np.repeat(np.array([registry_id(s) for s in shapes], np.uint32), [len(own) for own in corners])
+    growing = np.cumsum(trimesh.triangles.area(np.concatenate(corners)))
     for begin in range(0, photons, _BATCH):
         number = np.arange(begin, min(photons, begin + _BATCH))
         # Spread evenly over the area, and over each triangle (Osada et al. 2002).

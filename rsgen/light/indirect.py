@@ -47,7 +47,7 @@ _LEAST_SHARE, _MOST_SHARE = 0.3, 1.06  # of light that gets into lacquer: at 86 
 @dataclass(frozen=True)
 class Surfaces:
     """What is baked: a scene's lattice, its unique points, (2, points) which of them each lattice point's front and
-    back is, how far these count (see `barriers.Barriers`), and whether light is followed through panes.
+    back is, how far these count (see `sample_points`), and whether light is followed through panes.
     """
 
     scene: Any

@@ -288,7 +288,7 @@ def _lit(scene: ShippedScene) -> tuple[int, int]:
     from rsgen.device.backend import mitsuba
 
     mitsuba()
-    from rsgen.light.cache import cache_folder, cache_key
+    from rsgen.light.bake import cache_folder, cache_key
     from rsgen.scene.loading import content_hash
 
     lights = [load_config(file).light for file in scene.configs] or [LightConfig()]

@@ -280,7 +280,7 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, obj
     light = config.light
     if light.mode == "path":
         return mi.load_dict({"type": "path", "max_depth": light.max_depth})
-    from rsgen.light.cache import baked_field, cache_folder
+    from rsgen.light.bake import baked_field, cache_folder
     from rsgen.render.baked import BakedIntegrator
 
     try:

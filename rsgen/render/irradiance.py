@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned, vectors
 from rsgen.errors import UserError
-from rsgen.scene.meshes import coarser, inhabited_box, mesh_arrays
+from rsgen.scene.meshes import coarser, inhabited_box, mesh_corners, meshes_of
 
 REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of the way
 FREE = REACH_LEVELS  # and this, beyond the neighbour: nothing stands between
@@ -46,6 +46,17 @@ class Lattice:
     lacquered: NDArray[np.bool_]
     points: int
 
+    @property
+    def counts(self) -> IntArray:
+        """(f,) points of each triangle."""
+        return (self.cells + 1).prod(axis=1)
+
+    def places(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Triangle of each point, and the row along u and the column along v that it is in, (points,) each."""
+        face = np.repeat(np.arange(len(self.first)), self.counts)
+        row, column = np.divmod(np.arange(self.points) - self.first[face], self.cells[face, 1] + 1)
+        return face, row, column
+
     def packed(self) -> NDArray[np.uint32]:
         """(f,) cells and apex of each triangle in one word for the device."""
         return (self.cells[:, 0] | self.cells[:, 1] << 12 | self.apex << 24).astype(np.uint32)
@@ -61,22 +72,21 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
 
     Raises UserError, before it takes the memory, if baking so many samples would need more than 4 GB.
     """
-    shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    shapes = meshes_of(scene)
     ids = [registry_id(shape) for shape in shapes]
     shape_first = np.full(max(ids) + 1, -1, np.int32)
     lacquered = np.zeros(len(shape_first), bool)
     sides, apexes, faces_before = [], [], 0
     box = inhabited_box(shapes)
     for shape, number in zip(shapes, ids, strict=True):
-        vertices, faces = mesh_arrays(shape)
-        corners = vertices[faces].astype(np.float64)
+        corners = mesh_corners(shape)
         # edge k is opposite corner k
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
         sides.append(np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1) / coarser(corners, box)[:, None])
         apexes.append(np.argmin(edges, axis=1))
         shape_first[number] = faces_before
         lacquered[number] = _lacquered(shape.bsdf())
-        faces_before += len(faces)
+        faces_before += len(corners)
     lengths = np.concatenate(sides)
     _check_size(lengths, spacing)
     cells = _cells(lengths, spacing)
@@ -134,10 +144,7 @@ def _gigabytes(points: int) -> str:
 
 def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
     """Triangle index (points,) and Mitsuba's barycentric (b1, b2) (points, 2) of every lattice point."""
-    counts = (lattice.cells + 1).prod(axis=1)
-    face = np.repeat(np.arange(len(counts)), counts)
-    local = np.arange(lattice.points) - lattice.first[face]
-    row, column = np.divmod(local, lattice.cells[face, 1] + 1)
+    face, row, column = lattice.places()
     u, v = (k / np.maximum(n, 1) for k, n in zip((row, column), lattice.cells[face].T, strict=True))
     alone = lattice.cells[face, 0] == 0
     u[alone], v[alone] = 2 / 3, 0.5  # the middle
@@ -152,13 +159,9 @@ def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
 
 def lattice_area(scene: Any, lattice: Lattice) -> NDArray[np.float64]:
     """Area (points,) in m² that each lattice point stands for on one side: a triangle's points share out its own."""
-    meshes = [mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()]
-    corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
-    triangle = trimesh.triangles.area(corners)
-    counts = (lattice.cells + 1).prod(axis=1)
-    face = np.repeat(np.arange(len(counts)), counts)
+    triangle = trimesh.triangles.area(np.concatenate([mesh_corners(shape) for shape in meshes_of(scene)]))
+    face, row, column = lattice.places()
     nu, nv = lattice.cells[face].T
-    row, column = np.divmod(np.arange(lattice.points) - lattice.first[face], nv + 1)
     # Across a grid line at u a triangle is as wide as u: the strip about it, cut off at u = 1, has so much of the area.
     strip = np.minimum(row + 0.5, nu) ** 2 - np.maximum(row - 0.5, 0) ** 2
     along = np.where((column == 0) | (column == nv), 0.5, 1.0) / np.maximum(nv, 1)
@@ -264,8 +267,8 @@ def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> Irr
     """
     packed = lattice.packed()
     lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
-    keep = np.repeat(lit, (lattice.cells + 1).prod(axis=1))
-    counts = np.where(lit, (lattice.cells + 1).prod(axis=1), 0)
+    keep = np.repeat(lit, lattice.counts)
+    counts = np.where(lit, lattice.counts, 0)
     dark = lattice.points  # four zero entries follow the front values
     back_first = np.where(lit, dark + 4 + np.cumsum(counts) - counts, dark)
     back_packed = np.where(lit, packed, np.uint32(1 | 1 << 12))

@@ -24,7 +24,7 @@ from rsgen.errors import UserError
 from rsgen.formats import scene_reader, xml_helper
 from rsgen.inputs import check_input
 from rsgen.scene.board import BOARD_ID, Board, board_xml
-from rsgen.scene.meshes import repair_meshes, split_terrain
+from rsgen.scene.meshes import meshes_of, repair_meshes, split_terrain
 from rsgen.scene.placement import AS_IT_IS, SceneOptions, place, place_lamps
 from rsgen.scene.xml_scene import (
     Parsed,
@@ -66,7 +66,7 @@ def load_scene(path: Path, board: Board | None = None, options: SceneOptions = A
             raise
         except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do
             raise UserError(f"scene {path}: {_first_line(error)}") from None
-    if not any(shape.is_mesh() for shape in scene.shapes()):
+    if not meshes_of(scene):
         raise UserError(f"scene {path}: has no surfaces to render: add a shape")
     return split_terrain(mi, repair_meshes(mi, scene, path))
 

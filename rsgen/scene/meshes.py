@@ -74,8 +74,19 @@ def joined_triangles(vertices: Sequence[NDArray], faces: Sequence[NDArray]) -> t
 
 def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
-    vertices, faces = zip(*(mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()), strict=True)
+    vertices, faces = zip(*map(mesh_arrays, meshes_of(scene)), strict=True)
     return joined_triangles(vertices, faces)
+
+
+def meshes_of(scene: Any) -> list[Any]:
+    """The shapes of a scene that are meshes."""
+    return [shape for shape in scene.shapes() if shape.is_mesh()]
+
+
+def mesh_corners(shape: Any) -> FloatArray:
+    """Corners (m, 3, 3) of one Mitsuba mesh's triangles in the world frame."""
+    vertices, faces = mesh_arrays(shape)
+    return vertices[faces].astype(np.float64)
 
 
 def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
@@ -186,7 +197,7 @@ def coarser(corners: FloatArray, box: FloatArray) -> FloatArray:
 
 def split_terrain(mi: Any, scene: Any) -> Any:
     """The scene with the triangles of its terrain in parts, if it has any; meshes are changed in place."""
-    shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    shapes = meshes_of(scene)
     terrain = [_across(_vertices(shape)) > _BUILDING_M for shape in shapes]
     if all(terrain):
         return scene  # with nothing that it is around

@@ -10,7 +10,7 @@ from rendering import dr, mi
 
 from rsgen.config.config import LightConfig
 from rsgen.device.arrays import rows_of
-from rsgen.light import cache as lighting
+from rsgen.light import bake as lighting
 from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
 from rsgen.scene.loading import load_scene
 from rsgen.scene.rays import rays_from

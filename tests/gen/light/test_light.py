@@ -27,7 +27,7 @@ from rendering import constant_twist, dr, mi
 from rsgen.config.config import LightConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.light import cache as lighting
+from rsgen.light import bake as lighting
 from rsgen.light.interpolation import denoised, thin
 from rsgen.light.lamps import _draw, left_to_rays, near_lamps
 from rsgen.light.sampling import CHANNELS, PATCH, about_normal, sampled_adaptively, standard_error, visible_error
