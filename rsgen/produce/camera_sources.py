@@ -21,9 +21,8 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.color import Meter, Reading, Setting, apply_color_noise, apply_setting, reading, to_srgb8
-from rsgen.sensors.depth import apply_depth_noise, mixed_depth, register_depth, with_fixed_errors
+from rsgen.sensors.depth import apply_depth_noise, mixed_depth, register_depth, stereo_depth, with_fixed_errors
 from rsgen.sensors.seed import device_seed, frame_seed, noise_generator
-from rsgen.sensors.stereo import stereo_depth
 from rsgen.sequence.format import CLEAN_COLOR
 from rsgen.sequence.truth_files import FrameTable
 
@@ -102,7 +101,7 @@ class ColorSource:
         self._truth = TruthRenderer(stage.scene, stage.integrator, config, truth, *seen) if wanted else None
         self._dots = None
         if isinstance(config, RigColorConfig) and config.dots is not None:
-            from rsgen.sensors.dots import DotProjector
+            from rsgen.sensors.projectors import DotProjector
 
             self._dots = DotProjector(stage.scene, config.camera, shutter, config.dots, stage.seed)
 
@@ -194,7 +193,7 @@ class DepthSource:
         registered_to: tuple[Camera, FloatArray] | None = None,
     ) -> None:  # fmt: skip
         from rsgen.render import images as render
-        from rsgen.sensors.shadow import Projector
+        from rsgen.sensors.projectors import Projector
 
         self._stage, self._name, self.config, self._registered_to = stage, name, config, registered_to
         self._T_body_cam = None if (T_cam_body == np.eye(4)).all() else se3.inverse(T_cam_body)

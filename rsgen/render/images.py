@@ -185,28 +185,23 @@ class DepthRenderer:
         """What the pixels' rays meet in the frame at `stamp` (s)."""
         self.sensor.expose(T_world_cam, stamp)
         camera = self.sensor.camera
-        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
-        u, v = mi.Float(pixel % camera.width), mi.Float(pixel // camera.width)
-        position = mi.Point2f((u + 0.5) / camera.width, (v + 0.5) / camera.height)
-        ray, _ = self.sensor.sample_ray(0.5 * self.sensor.exposure, mi.Float(0), position, mi.Point2f(0.5))
+        u, v, ray = self.sensor.central_rays()
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
-        shape = camera.height, camera.width
         label = mi.UInt32(0) if self._instances is None else self._instances.seen_by(hit)
-        if self._objects is None:
-            z = dr.select(hit.is_valid(), hit.t * self.sensor.planar_depth_scale(u, v), 0)
-            dr.eval(z, label)
-            return DepthCast(np.array(z, np.float32).reshape(shape), None, self._labels(label, shape))
-        objects = self._objects.expose(camera, self.sensor.shutter, stamp)
-        meeting = objects.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
-        z = dr.select(dr.isfinite(meeting.t), meeting.t * self.sensor.planar_depth_scale(u, v), 0)
-        if self._instances is not None:
-            label = dr.select(meeting.number > 0, len(self._instances.names) + meeting.number, label)
-        dr.eval(z, meeting.number, label)
-        ids = np.array(meeting.number, np.float32).reshape(shape)
-        return DepthCast(np.array(z, np.float32).reshape(shape), ids, self._labels(label, shape))
-
-    def _labels(self, label: Any, shape: tuple[int, int]) -> UInt16Array | None:
-        return None if self._instances is None else np.array(label).astype(np.uint16).reshape(shape)
+        t, number = dr.select(hit.is_valid(), hit.t, dr.inf), mi.UInt32(0)
+        if self._objects is not None:
+            meeting = self._objects.expose(camera, self.sensor.shutter, stamp).meet(ray, t)
+            t, number = meeting.t, meeting.number
+            if self._instances is not None:
+                label = dr.select(number > 0, len(self._instances.names) + number, label)
+        z = dr.select(dr.isfinite(t), t * self.sensor.planar_depth_scale(u, v), 0)
+        dr.eval(z, number, label)
+        shape = camera.height, camera.width
+        return DepthCast(
+            np.array(z, np.float32).reshape(shape),
+            None if self._objects is None else np.array(number, np.float32).reshape(shape),
+            None if self._instances is None else np.array(label).astype(np.uint16).reshape(shape),
+        )
 
 
 _BITS = 32

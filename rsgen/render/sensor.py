@@ -99,6 +99,14 @@ class RollingShutterSensor(mi.Sensor):
         ray.has_differentials = True
         return ray, weight
 
+    def central_rays(self):
+        """u and v of all pixels, row by row, and the rays through their centres at their lines' mid-exposure."""
+        camera = self.camera
+        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
+        u, v = mi.Float(pixel % camera.width), mi.Float(pixel // camera.width)
+        position = mi.Point2f((u + 0.5) / camera.width, (v + 0.5) / camera.height)
+        return u, v, self.sample_ray(0.5 * self.exposure, mi.Float(0), position, mi.Point2f(0.5))[0]
+
     def axes(self, time, sample2):
         """The camera's x, y and z axes in the world at `time` after the lines at film positions `sample2` opened."""
         camera = self.camera

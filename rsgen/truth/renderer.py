@@ -178,15 +178,12 @@ class TruthRenderer:
 
     def _cast(self, now: MovingCamera, shutter: Shutter, things: ObjectsInFrame | None) -> _PixelHits:
         """What the pixels' centres see at their lines' mid-exposure. The sensor must be exposed to the frame."""
-        camera = self._camera
-        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
-        uv = mi.Point2f(pixel % camera.width, pixel // camera.width)
-        position = mi.Point2f((uv.x + 0.5) / camera.width, (uv.y + 0.5) / camera.height)
-        ray, _ = self._sensor.sample_ray(0.5 * shutter.exposure_s, mi.Float(0), position, mi.Point2f(0.5))
+        u, v, ray = self._sensor.central_rays()
+        uv = mi.Point2f(u, v)
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
         normal = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
         normal = dr.select(hit.is_valid(), dr.select(dr.dot(normal, ray.d) < 0, normal, -normal), 0)
-        begin = now.lens.line_of(*uv) * shutter.line_delay(camera)
+        begin = now.lens.line_of(*uv) * shutter.line_delay(self._camera)
         origin, R_world_cam = now.pose(begin + 0.5 * shutter.exposure_s)
         w = dr.select(hit.is_valid(), mi.Float(1), 0)
         p = dr.select(hit.is_valid(), mi.Point3f(origin) + hit.t * ray.d, ray.d)
