@@ -145,7 +145,7 @@ def preview(
 def _contact_sheet(what: Path, out: Path | None, every_s: float, progress: Progress) -> Path:
     """Of a sequence, else of the config that is called so."""
     from rsgen.config.config import load_config
-    from rsgen.pictures.sheet import sheet_of_config, sheet_of_sequence
+    from rsgen.pictures.frames import sheet_of_config, sheet_of_sequence
 
     if what.is_dir():
         return sheet_of_sequence(what, out, every_s)

@@ -15,8 +15,7 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.lens import Lens, contains, distort
-from rsgen.device.pose_table import PoseTable
+from rsgen.device.lens import Lens, PoseTable, contains, distort
 from rsgen.geometry.camera import Camera
 
 Vector = tuple[Any, Any, Any]

@@ -151,7 +151,7 @@ def load_scene(config: Config) -> Any:
 
     mitsuba(config.backend)
     from rsgen.scene import loading
-    from rsgen.scene.board import Board
+    from rsgen.scene.loading import Board
 
     target = config.target
     board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))

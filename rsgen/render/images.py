@@ -15,7 +15,7 @@ from scipy.stats import qmc
 
 from rsgen.array_types import Float32Array, UInt16Array
 from rsgen.device.arrays import aligned, recorded
-from rsgen.device.pose_table import PoseFunction
+from rsgen.device.lens import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator

@@ -23,8 +23,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rsgen.device.lens import Lens, undistort
-from rsgen.device.pose_table import PoseFunction, PoseTable
+from rsgen.device.lens import Lens, PoseFunction, PoseTable, undistort
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 

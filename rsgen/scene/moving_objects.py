@@ -22,7 +22,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
-from rsgen.device.pose_table import PoseTable
+from rsgen.device.lens import PoseTable
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline

@@ -14,7 +14,7 @@ import numpy as np
 from rsgen.array_types import BoolArray, Float32Array, FloatArray
 from rsgen.config.rig import DotsConfig
 from rsgen.device.arrays import aligned
-from rsgen.device.pose_table import PoseFunction
+from rsgen.device.lens import PoseFunction
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.sensor import RollingShutterSensor

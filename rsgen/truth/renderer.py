@@ -34,8 +34,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, FloatArray
 from rsgen.config.cameras import ColorConfig
 from rsgen.config.sections import GlobalTime, TruthConfig
-from rsgen.device.lens import Lens, contains
-from rsgen.device.pose_table import PoseFunction, PoseTable
+from rsgen.device.lens import Lens, PoseFunction, PoseTable, contains
 from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter

@@ -38,9 +38,9 @@ from rsgen.formats.export.shared import (
 )
 from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import ground_truth, pose_rows
 from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.truth.settings import sequence_imu
 
 _MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"} | dict.fromkeys(
     ("radtan", "rational"), "radial-tangential"

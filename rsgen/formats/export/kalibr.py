@@ -28,8 +28,8 @@ from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import nanoseconds, write_imu_csv
+from rsgen.sensors.reports import SequenceImu, sequence_imu, sequence_target
 from rsgen.sequence.images import ImageStream, Rig
-from rsgen.truth.settings import SequenceImu, sequence_imu, sequence_target
 
 IMU_TOPIC = "/imu0"
 _MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}

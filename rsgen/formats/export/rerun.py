@@ -18,9 +18,9 @@ from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.formats.export.shared import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.truth.settings import sequence_imu
 
 TIMELINE = "time"
 _UP = {(0, 1): "X_DOWN", (0, -1): "X_UP", (1, 1): "Y_DOWN", (1, -1): "Y_UP", (2, 1): "Z_DOWN", (2, -1): "Z_UP"}

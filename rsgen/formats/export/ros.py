@@ -31,9 +31,9 @@ from rsgen.formats.export.shared import ExportOptions, counted, image_streams
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import nanoseconds
+from rsgen.sensors.reports import SequenceImu, sequence_imu
 from rsgen.sequence.format import ground_truth, pose_rows, poses_of_rows
 from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.truth.settings import SequenceImu, sequence_imu
 
 COLOR_FRAME, DEPTH_FRAME, IMU_FRAME = (f"camera_{name}_optical_frame" for name in ("color", "depth", "imu"))
 WORLD_FRAME, BODY_FRAME = "world", "body"

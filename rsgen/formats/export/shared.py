@@ -20,11 +20,10 @@ from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
-from rsgen.sensors.reports import reported_poses
+from rsgen.sensors.reports import reported_poses, sequence_mocap
 from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.truth.settings import sequence_mocap
 
 Storage = Literal["sqlite3", "mcap"]
 EPOCH_S = 1_000_000_000

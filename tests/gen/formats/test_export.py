@@ -27,10 +27,10 @@ from rsgen.formats.export.shared import place_images
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import exact_imu
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.images import Sequence
 from rsgen.sequence.reader import read_sequence
-from rsgen.truth.settings import sequence_imu
 
 
 @pytest.fixture(scope="module")

@@ -22,10 +22,10 @@ from rsgen.formats.export.shared import ExportOptions, Storage
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import ground_truth, poses_of_rows
 from rsgen.sequence.images import Sequence
 from rsgen.sequence.reader import read_sequence
-from rsgen.truth.settings import sequence_imu
 
 KINDS: list[tuple[str, Storage, str]] = [
     ("ros1", "sqlite3", "a.bag"),
