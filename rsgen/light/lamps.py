@@ -26,6 +26,7 @@ from rsgen.light.sampling import (
     CHANNELS,
     about_normal,
     in_channels,
+    in_halves,
     part_of,
     r2,
     rotation,
@@ -154,8 +155,9 @@ def _draw(scene: Any, emitter: Any, dimension: int, points: SamplePoints, which:
     return sampler_at(points, which, sample)
 
 
-@dr.syntax
-def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follow):
+def _from_emitter(
+    scene: Any, emitter: Any, p: Any, n: Any, number: Any, begin: int, samples: int, dimension: int, follow: bool
+) -> tuple[Any, Any]:
     """Sums over two halves of the samples `begin` to `begin + samples` of irradiance at p (normal n) from one emitter.
 
     If that is None, from random ones but the sky.
@@ -167,28 +169,23 @@ def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follo
     offset = mi.Point2f(rotation(number, 2 * dimension), rotation(number, 2 * dimension + 1))
     # Not part of the program: what is compiled for one lamp serves for all.
     lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else _registry_id(emitter)))
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, samples)
-    even, odd = mi.Vector4f(0), mi.Vector4f(0)
-    while i < end:
+
+    def light(i: Any) -> Any:
         u = r2(i, offset)
-        if dr.hint(emitter is None, mode="scalar"):
+        if emitter is None:
             ds, value = scene.sample_emitter_direction(it, u, False)
-            if dr.hint(scene.environment() is not None, mode="scalar"):
+            if scene.environment() is not None:
                 value = dr.select(ds.emitter == mi.EmitterPtr(scene.environment()), 0, value)
         else:
             ds, value = lamp.sample_direction(it, u)
         cosine = dr.dot(n, ds.d)
         lit = (cosine > 0) & (ds.pdf > 0) & (dr.max(value) > 0)
         arrives = transmitted(scene, p, ds.d, ds.dist, lit, follow)
-        light = value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine))
+        brought = value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine))
         # What misses a lamp with a picture has no direction: a cosine that is NaN would be in the sum, times 0.
-        light = in_channels(dr.select(lit, light * arrives, 0), dr.select(lit, cosine, 0))
-        first = (i & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return even, odd
+        return in_channels(dr.select(lit, brought * arrives, 0), dr.select(lit, cosine, 0))
+
+    return in_halves(begin, samples, light)
 
 
 def _light_share(light_pdf: Any, cosine: Any) -> Any:

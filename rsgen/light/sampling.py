@@ -48,8 +48,24 @@ def r2(i: Any, offset: Any) -> Any:
 
 
 @dr.syntax
-def about_normal(p, n, number, begin, count, dimension, light_along):
-    """Sums (Vector4f) over two halves of the cosine-distributed rays `begin` to `begin + count` from p about n.
+def in_halves(begin, count, light, bit=1):
+    """Sums (Vector4f) over two halves of the samples light(i), i from `begin` to `begin + count`, by a bit of i."""
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, count)
+    even, odd = mi.Vector4f(0), mi.Vector4f(0)
+    while i < end:
+        sample = light(i)
+        first = (i & bit) == 0
+        even += dr.select(first, sample, 0)
+        odd += dr.select(first, 0, sample)
+        i += 1
+    return even, odd
+
+
+def about_normal(
+    p: Any, n: Any, number: Any, begin: int, count: int, dimension: int, light_along: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, Any]:
+    """Sums over two halves of the cosine-distributed rays `begin` to `begin + count` from p about n.
 
     dimension: the first of three for random numbers (see `rotation`). light_along: of (ray, its number i, a uniform
     number for lots) π times the radiance that comes along it: with pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
@@ -57,19 +73,14 @@ def about_normal(p, n, number, begin, count, dimension, light_along):
     frame = mi.Frame3f(n)
     offset = mi.Point2f(rotation(number, dimension), rotation(number, dimension + 1))
     lobe = rotation(number, dimension + 2)
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, count)
-    even, odd = mi.Vector4f(0), mi.Vector4f(0)
-    while i < end:
+
+    def light(i: Any) -> Any:
         d = mi.warp.square_to_cosine_hemisphere(r2(i, offset))
         pick = lobe + mi.Float(i) * 0.6180339887498949
         pick -= dr.floor(pick)
-        light = in_channels(light_along(mi.Ray3f(p, frame.to_world(d)), i, pick), d.z)
-        first = (i & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return even, odd
+        return in_channels(light_along(mi.Ray3f(p, frame.to_world(d)), i, pick), d.z)
+
+    return in_halves(begin, count, light)
 
 
 def shaded_nearby(scene: Any, points: SamplePoints, which: NDArray, within_m: float, rays: int) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
 from rsgen.light.interpolation import thin
-from rsgen.light.sampling import chunks, in_channels, r2, rotation, sampled_adaptively, sampler_at
+from rsgen.light.sampling import chunks, in_channels, in_halves, r2, rotation, sampled_adaptively, sampler_at
 from rsgen.light.specular_paths import first_scatterer, passes_light_on
 from rsgen.light.surface_points import SamplePoints
 
@@ -119,26 +119,21 @@ def _arriving(scene: Any, p: Any, n: Any, d: Any, pick: Any, follow: bool) -> tu
     return found, dr.select(found, through * emitter.eval(si, found) * cosine, 0)
 
 
-@dr.syntax
-def _sky_at(scene, guide, cell, p, n, number, begin, samples, follow):
+def _sky_at(
+    scene: Any, guide: Guide, cell: Any, p: Any, n: Any, number: Any, begin: int, samples: int, follow: bool
+) -> tuple[Any, Any]:
     """Sums over two halves of the samples `begin` to `begin + samples`."""
     offset = mi.Point2f(rotation(number, 204), rotation(number, 205))
     lobe = rotation(number, 206)
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, samples)
-    even, odd = mi.Vector4f(0), mi.Vector4f(0)
-    while i < end:
+
+    def light(i: Any) -> Any:
         u = r2(i >> 1, offset)
         guided = (guide.sample(cell, u), lambda d: guide.density(cell, d))
         d, density = _drawn(scene, p, n, u, (i & 1) == 1, guided)
-        found, light = _arriving(scene, p, n, d, lobe + mi.Float(i) * 0.6180339887498949, follow)
-        light = dr.select(found & (density > 0), light / dr.maximum(density, 1e-20), 0)
-        light = in_channels(light, dr.dot(n, d))
-        first = ((i >> 1) & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return even, odd
+        found, brought = _arriving(scene, p, n, d, lobe + mi.Float(i) * 0.6180339887498949, follow)
+        return in_channels(dr.select(found & (density > 0), brought / dr.maximum(density, 1e-20), 0), dr.dot(n, d))
+
+    return in_halves(begin, samples, light, bit=2)  # of each two one is the sky's own and one guided
 
 
 class Guide:
