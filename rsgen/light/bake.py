@@ -8,9 +8,9 @@
 3. Points that no light reaches (buried in another object) are marked as not alive. Where something stands on a surface,
    `surface_points` limits how far its points count.
 
-A point gets as many samples as the visible error of their scatter needs (`sampling`). The scatter that is left is
-smoothed where it hides any difference (`interpolation`). All randomness is a fixed low-discrepancy sequence rotated by
-a hash of the point's number: a scene bakes to the same bytes each time on one backend.
+A point gets as many samples as the visible error of their scatter needs, and the scatter that is left is smoothed
+where it hides any difference (`sampling`). All randomness is a fixed low-discrepancy sequence rotated by a hash of the
+point's number: a scene bakes to the same bytes each time on one backend.
 """
 
 from __future__ import annotations
@@ -38,10 +38,19 @@ from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.light.caustics import caustic_light
 from rsgen.light.indirect import Surfaces, gathering, light_off_surfaces
-from rsgen.light.interpolation import Interpolation, denoised, thin
 from rsgen.light.lamps import first_look, lamp_light, straight_through_bulbs
 from rsgen.light.quality import estimated_quality
-from rsgen.light.sampling import CHANNELS, GREY_SLOPE, PATCH, part_of, standard_error, typical
+from rsgen.light.sampling import (
+    CHANNELS,
+    GREY_SLOPE,
+    PATCH,
+    Interpolation,
+    denoised,
+    part_of,
+    standard_error,
+    thin,
+    typical,
+)
 from rsgen.light.sky import has_sky_light, sky_light
 from rsgen.light.specular_paths import passes_light_on
 from rsgen.light.surface_points import sample_points

@@ -19,8 +19,7 @@ from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned, rows_of
-from rsgen.light.interpolation import thin
-from rsgen.light.sampling import CHANNELS, about_normal, in_channels, rotation, sampler_at, shaded_nearby
+from rsgen.light.sampling import CHANNELS, about_normal, in_channels, rotation, sampler_at, shaded_nearby, thin
 from rsgen.light.specular_paths import SPECULAR, casts_caustics, caustic_radiance, transmitted
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import at_triangles, registry_id

@@ -16,16 +16,18 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
-from rsgen.light.interpolation import Interpolation, denoised, thin
 from rsgen.light.sampling import (
     CHANNELS,
     PATCH,
+    Interpolation,
     Sampler,
     about_normal,
+    denoised,
     part_of,
     sampled_adaptively,
     sampler_at,
     standard_error,
+    thin,
     visible_error,
 )
 from rsgen.light.specular_paths import shines, surface_radiance

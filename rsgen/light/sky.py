@@ -16,8 +16,7 @@ import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.interpolation import thin
-from rsgen.light.sampling import chunks, in_channels, in_halves, r2, rotation, sampled_adaptively, sampler_at
+from rsgen.light.sampling import chunks, in_channels, in_halves, r2, rotation, sampled_adaptively, sampler_at, thin
 from rsgen.light.specular_paths import first_scatterer, passes_light_on
 from rsgen.light.surface_points import SamplePoints
 

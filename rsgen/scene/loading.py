@@ -31,7 +31,7 @@ from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.image_codecs import encode_png
 from rsgen.inputs import check_input
 from rsgen.scene.meshes import meshes_of, ply_bytes, repair_meshes, split_terrain
-from rsgen.scene.placement import AS_IT_IS, SceneOptions, place, place_lamps
+from rsgen.scene.placement import ANALYTIC, AS_IT_IS, SceneOptions, place, place_lamps, tessellated, turn_mirrored
 from rsgen.scene.xml_scene import (
     Parsed,
     check_files,
@@ -43,7 +43,6 @@ from rsgen.scene.xml_scene import (
     prepare,
     unknown_properties,
 )
-from rsgen.scene.xml_shapes import ANALYTIC, tessellated, turn_mirrored
 
 log = logging.getLogger("rsgen")
 
@@ -58,20 +57,16 @@ def load_scene(path: Path, board: Board | None = None, options: SceneOptions = A
     """
     ensure_built(path)
     mi = mitsuba()
-    with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi) as messages:
-        try:
-            if path.suffix.lower() == ".xml":
-                scene = _load_xml(mi, path, Path(scratch), board, messages, options)
-            else:
-                shapes = scene_reader(path.suffix).scene_dict(mi, path, Path(scratch), options)
-                if board is not None:
-                    shapes["target"] = mi.load_string(board_xml(board, Path(scratch)))
-                # Else shapes would be merged, and ordered by memory address.
-                scene = mi.load_dict(shapes, parallel=False, optimize=False)
-        except UserError:
-            raise
-        except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do
-            raise UserError(f"scene {path}: {_first_line(error)}") from None
+    scratch_folder = tempfile.TemporaryDirectory(prefix="rsgen-scene-")
+    with scratch_folder as scratch, messages_to_log(mi) as messages, _faults_of(path):
+        if path.suffix.lower() == ".xml":
+            scene = _load_xml(mi, path, Path(scratch), board, messages, options)
+        else:
+            shapes = scene_reader(path.suffix).scene_dict(mi, path, Path(scratch), options)
+            if board is not None:
+                shapes["target"] = mi.load_string(board_xml(board, Path(scratch)))
+            # Else shapes would be merged, and ordered by memory address.
+            scene = mi.load_dict(shapes, parallel=False, optimize=False)
     if not meshes_of(scene):
         raise UserError(f"scene {path}: has no surfaces to render: add a shape")
     return split_terrain(mi, repair_meshes(mi, scene, path))
@@ -114,13 +109,8 @@ def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
             raise UserError(f"scene {path}: is malformed ({_first_line(error)}): export it again") from None
     else:
         mi = mitsuba()
-        with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi):
-            try:
-                parsed = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
-            except UserError:
-                raise
-            except Exception as error:
-                raise UserError(f"scene {path}: {_first_line(error)}") from None
+        with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi), _faults_of(path):
+            parsed = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
         state, changes = parsed.state, parsed.changes
         if changes is not None:
             digest.update(xml_helper("older version").METHOD)
@@ -141,6 +131,17 @@ def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
             if file.suffix.lower() == ".obj":
                 digest.update(xml_helper("mesh files").triangles_mark(data))
     return digest.hexdigest()
+
+
+@contextmanager
+def _faults_of(path: Path) -> Iterator[None]:
+    """Mitsuba and trimesh raise whatever their parsers do: UserErrors, naming the scene."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"scene {path}: {_first_line(error)}") from None
 
 
 def _load_xml(

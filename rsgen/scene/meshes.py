@@ -122,6 +122,16 @@ def repair_meshes(mi: Any, scene: Any, path: Path) -> Any:
     return rebuilt(mi, scene, flat) if changed or flat else scene
 
 
+def grid_faces(rows: int, columns: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Row and column (n,) of each square of a grid whose (rows + 1) x (columns + 1) vertices are numbered row by row,
+    and the squares' triangles (2 n, 3), of all of them the first halves first.
+    """
+    i, j = (axis.ravel() for axis in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    p = i * (columns + 1) + j
+    q = p + columns + 1
+    return i, j, np.concatenate([np.stack([p, q, q + 1], -1), np.stack([p, q + 1, p + 1], -1)])
+
+
 def rebuilt(mi: Any, scene: Any, left_out: Collection[int] = ()) -> Any:
     """A new scene of all shapes but those numbered in `left_out`, and of all lamps that are no shapes.
 
@@ -177,9 +187,6 @@ def vertex_normals(vertices: Float32Array, faces: NDArray, otherwise: tuple[floa
     total = np.stack([np.bincount(faces.ravel(), normal[:, k], len(vertices)) for k in range(3)], axis=-1)
     length = np.linalg.norm(total, axis=-1, keepdims=True)
     return np.where(length > 0, total / np.where(length > 0, length, 1), otherwise)
-
-
-log = logging.getLogger("rsgen")
 
 
 def inhabited_box(shapes: Sequence[Any]) -> FloatArray:

@@ -21,7 +21,7 @@ import numpy as np
 from rsgen.errors import UserError, first_few
 from rsgen.formats import xml_helper
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
-from rsgen.scene.xml_shapes import children, flatten
+from rsgen.scene.placement import children, flatten, pose_of
 
 log = logging.getLogger("rsgen")
 
@@ -94,7 +94,7 @@ def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
     for node in state.nodes:
         props = node.props
         if node.type == mi.ObjectType.Shape and "to_world" in props:
-            pose = np.asarray(props["to_world"].matrix, float).reshape(4, 4)
+            pose = pose_of(props)
             linear, size = pose[:3, :3], float(np.linalg.norm(pose[:3, :3]))
             if not np.isfinite(pose).all() or abs(float(np.linalg.det(linear))) <= 1e-12 * size**3:
                 what = props.id() or props.plugin_name()

@@ -28,9 +28,17 @@ from rsgen.config.config import LightConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.light import bake as lighting
-from rsgen.light.interpolation import denoised, thin
 from rsgen.light.lamps import _draw, left_to_rays, near_lamps
-from rsgen.light.sampling import CHANNELS, PATCH, about_normal, sampled_adaptively, standard_error, visible_error
+from rsgen.light.sampling import (
+    CHANNELS,
+    PATCH,
+    about_normal,
+    denoised,
+    sampled_adaptively,
+    standard_error,
+    thin,
+    visible_error,
+)
 from rsgen.light.sky import BINS, Guide, bin_of
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.baked import BakedIntegrator

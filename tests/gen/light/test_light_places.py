@@ -27,8 +27,8 @@ from lit import (
 from rsgen import srgb
 from rsgen.config.config import LightConfig
 from rsgen.light import bake as lighting
-from rsgen.light.interpolation import Interpolation, thin
 from rsgen.light.quality import estimated_quality
+from rsgen.light.sampling import Interpolation, thin
 from rsgen.light.surface_points import SamplePoints, find_covered, sample_points
 from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
 from rsgen.scene.meshes import surface
