@@ -126,7 +126,7 @@ def distort(camera: Camera, x: Any, y: Any) -> Distorted:
         return Distorted(x, y, 1.0, 0.0, 1.0, 1.0)
     r2 = x * x + y * y
     if camera.model in ("radtan", "rational"):
-        k1, k2, p1, p2, k3 = _brown(camera)
+        k1, k2, p1, p2, k3 = camera.brown
         scale = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
         if camera.model == "rational":
@@ -183,7 +183,7 @@ def undistort(camera: Camera, xd: Any, yd: Any) -> tuple[Any, Any]:
             ex, ey, inverse = d.x - xd, d.y - yd, dr.rcp(d.dxx * d.dyy - d.dxy * d.dxy)
             x, y = x - (d.dyy * ex - d.dxy * ey) * inverse, y - (d.dxx * ey - d.dxy * ex) * inverse
         return x, y
-    k1, k2, p1, p2, k3 = _brown(camera)
+    k1, k2, p1, p2, k3 = camera.brown
     x, y = xd, yd
     for _ in range(_UNDISTORT_STEPS):
         d, r2 = distort(camera, x, y), x * x + y * y
@@ -197,12 +197,6 @@ def undistort(camera: Camera, xd: Any, yd: Any) -> tuple[Any, Any]:
         inverse = dr.rcp(a * c - b * b)
         x, y = x - (c * ex - b * ey) * inverse, y - (a * ey - b * ex) * inverse
     return x, y
-
-
-def _brown(camera: Camera) -> tuple[float, float, float, float, float]:
-    """k1 k2 p1 p2 k3 of a radial-tangential or rational camera."""
-    k1, k2, p1, p2, k3 = (*camera.distortion, 0.0)[:5]
-    return k1, k2, p1, p2, k3
 
 
 def _bend(camera: Camera, theta: Any) -> tuple[Any, Any]:

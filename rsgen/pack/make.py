@@ -1,6 +1,6 @@
 """A training pack: many short sequences, each drawn, rendered and written by itself, whole or not at all.
 
-made = make_pack((config,), PackOptions(count=1000), seed=0, out=Path("packs/demo"), workers=InProcess())
+made = make_pack((config,), PackOptions(count=1000), seed=0, out=Path("packs/demo"), workers=Workers())
 """
 
 from __future__ import annotations

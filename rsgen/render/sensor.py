@@ -24,6 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from rsgen.device.lens import Lens, PoseFunction, PoseTable, undistort
+from rsgen.device.projection import rotated
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 
@@ -134,7 +135,7 @@ class RollingShutterSensor(mi.Sensor):
         """Origin and rotation at `t` seconds after the first line's shutter opened."""
         rows = self._poses.at(t)
         origin = mi.Point3f(*(row.w for row in rows))
-        return origin, lambda d: dr.normalize(mi.Vector3f(*(row.x * d.x + row.y * d.y + row.z * d.z for row in rows)))
+        return origin, lambda d: dr.normalize(mi.Vector3f(*rotated(rows, d)))
 
     def _direction(self, u, v):
         """Direction (x, y, 1) in the camera's frame of pixel position (u, v), distortion undone."""

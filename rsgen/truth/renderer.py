@@ -183,13 +183,13 @@ class TruthRenderer:
         normal = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
         normal = dr.select(hit.is_valid(), dr.select(dr.dot(normal, ray.d) < 0, normal, -normal), 0)
         begin = now.lens.line_of(*uv) * shutter.line_delay(self._camera)
-        origin, R_world_cam = now.pose(begin + 0.5 * shutter.exposure_s)
+        origin, rows = now.pose(begin + 0.5 * shutter.exposure_s)
         w = dr.select(hit.is_valid(), mi.Float(1), 0)
         p = dr.select(hit.is_valid(), mi.Point3f(origin) + hit.t * ray.d, ray.d)
         z = dr.select(hit.is_valid(), hit.t * self._sensor.planar_depth_scale(uv.x, uv.y), 0)
         label = mi.UInt32(0) if self._instances is None else self._instances.seen_by(hit)
         if things is None:
-            return _PixelHits(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z, label=label)
+            return _PixelHits(uv, begin, p, w, normal, rotated_back(rows, normal), z, label=label)
         meeting = things.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
         met, number = meeting.number > 0, meeting.number
         p = dr.select(met, things.place(meeting), p)
@@ -199,7 +199,7 @@ class TruthRenderer:
         dr.eval(p, normal, number, z, w)
         if self._instances is not None:
             label = dr.select(met, len(self._instances.names) + number, label)
-        n_cam = rotated_back(R_world_cam, n_world)
+        n_cam = rotated_back(rows, n_world)
         return _PixelHits(uv, begin, p, dr.select(met, 1, w), normal, n_cam, z, number, label)
 
     def _flow(

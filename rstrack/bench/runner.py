@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
-from rsgen.console.scheduler import InProcess, Workers
+from rsgen.console.scheduler import DaskWorkers, Workers
 from rsgen.device.backend import select
 from rsgen.errors import UserError
 from rstrack.bench.cells import Benchmark, Cell
@@ -114,9 +114,9 @@ def run_cells(
         show(f"{name} {note}")
 
     try:
-        if workers is not None and not isinstance(workers, InProcess):
+        if isinstance(workers, DaskWorkers):
             _render(todo, progress)
-        for k, record in (workers or InProcess()).apply(run_cell, todo, report):
+        for k, record in (workers or Workers()).apply(run_cell, todo, report):
             records[record.cell] = record
             running.pop(record.cell, None)
             if record.error is None and read_record(todo[k].out / RECORD) is None:

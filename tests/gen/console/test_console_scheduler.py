@@ -20,7 +20,7 @@ import tiny
 from rsgen.cli.main import main
 from rsgen.config.config import Config, load_config
 from rsgen.console import scheduler
-from rsgen.console.scheduler import DaskWorkers, InProcess, open_workers
+from rsgen.console.scheduler import DaskWorkers, Workers, open_workers
 from rsgen.errors import UserError
 from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
 from rsgen.produce.generate import render_sequence
@@ -133,7 +133,7 @@ def wait_for(condition: Any) -> None:
 def test_every_job_is_done_once(remote: bool, workers: DaskWorkers, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduler, "_LEAST_AHEAD", 2)
     monkeypatch.setattr(scheduler, "_AHEAD_PER_WORKER", 0)
-    where, told = workers if remote else InProcess(), []
+    where, told = workers if remote else Workers(), []
     jobs = [3, 1, 2, 3, 5, 4]
     results = list(where.apply(square, jobs, lambda *what: told.append(what)))
     assert sorted(results) == [(i, job * job) for i, job in enumerate(jobs)]
