@@ -122,7 +122,8 @@ def check_scene(sequence: Rig) -> tuple[bool, str]:
     outside = 0.0
     for stream in (stream for stream in sequence.streams.values() if stream.is_depth):
         for k in _spread(len(stream.paths), _SCENE_FRAMES):
-            p_world = depth_points(sequence, k, stream.name)
+            p_world, number, _ = _depth_pixels(sequence, k, stream.name)
+            p_world = p_world[number == 0]
             outside = max(outside, float(np.maximum(bounds[0] - p_world, p_world - bounds[1]).max(initial=0.0)))
     size = " x ".join(f"{length:.2f}" for length in bounds[1] - bounds[0])
     detail = f"{counts[1]} triangles, {size} m, depth at most {outside * 1e3:.3f} mm outside"
@@ -151,17 +152,17 @@ def reproject_depth(sequence: Rig, k: int, next_k: int, name: str = "depth") -> 
     stream = sequence.streams[name]
     stamp = float(stream.stamps[next_k])
     next_z = sequence.exact_depth(name, next_k).astype(np.float64)
-    seen = _depth_pixels(sequence, k, name)
+    p_world, number, t_seen = _depth_pixels(sequence, k, name)
     residuals, numbers, occluded = [np.zeros(0)], [np.zeros(0, np.int64)], 0
     for which in range(len(sequence.objects) + 1):
-        here = seen.number == which
+        here = number == which
         if not here.any():
             continue
-        points: FloatArray = seen.p_world[here]
+        points = p_world[here]
         motion: Any = sequence.spline
         if which:
             thing = sequence.objects[which - 1]
-            points = se3.transform(se3.inverse(thing.spline.pose(seen.t[here])), points)
+            points = se3.transform(se3.inverse(thing.spline.pose(t_seen[here])), points)
             motion = RelativeMotion(sequence.spline, thing.spline)
         uv_next, t, valid = project_rolling(motion, np.eye(4), stream.camera, stream.shutter, stamp, points)
         uv_next, t = uv_next[valid], t[valid]
@@ -175,26 +176,12 @@ def reproject_depth(sequence: Rig, k: int, next_k: int, name: str = "depth") -> 
     return Reprojection(np.concatenate(residuals), occluded, np.concatenate(numbers))
 
 
-def depth_points(sequence: Rig, k: int, name: str) -> FloatArray:
-    """Points (n, 3) in the world that every fourth pixel of exact depth k shows, each from its own line's pose.
+def _depth_pixels(sequence: Rig, k: int, name: str) -> tuple[FloatArray, IntArray, FloatArray]:
+    """What every fourth row and column of exact depth k of a camera shows, each pixel from its own line's pose.
 
-    Without those on moving objects. Raises UserError for unreadable files.
+    Points (n, 3) in the world, numbers (n,) of the objects they are on, and their lines' times (n,), s. Raises
+    UserError for unreadable files.
     """
-    seen = _depth_pixels(sequence, k, name)
-    return seen.p_world[seen.number == 0]
-
-
-@dataclass(frozen=True)
-class _DepthPixels:
-    """n pixels: points (n, 3) in the world, numbers (n,) of the objects they are on, and their lines' times (n,), s."""
-
-    p_world: FloatArray
-    number: IntArray
-    t: FloatArray
-
-
-def _depth_pixels(sequence: Rig, k: int, name: str) -> _DepthPixels:
-    """What every fourth row and column of exact depth k of a camera shows."""
     stream = sequence.streams[name]
     camera = stream.camera
     step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
@@ -202,7 +189,7 @@ def _depth_pixels(sequence: Rig, k: int, name: str) -> _DepthPixels:
     uv = camera.pixel_grid()[::step, ::step][z > 0]
     p_world = se3.transform(sequence.pixel_poses(name, k, uv), camera.backproject(uv, z[z > 0]))
     t = stream.shutter.line_mid_time(float(stream.stamps[k]), stream.shutter.line_of_pixel(uv, camera), camera)
-    return _DepthPixels(p_world, sequence.object_ids(name, k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t))
+    return p_world, sequence.object_ids(name, k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t)
 
 
 def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, BoolArray]:

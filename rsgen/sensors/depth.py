@@ -9,7 +9,6 @@ noise. A stereo camera's depth is computed from its images, as it does itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -151,13 +150,13 @@ def incidence(d: Float32Array, camera: Camera) -> Float32Array:
     C = d − A x − B y, cos θ = d / (|(A, B, C)| |(x, y, 1)|). Slopes are one-sided differences, of two the
     smaller, which keeps to one side of an edge. Rows are treated as if all had one pose.
     """
-    rays = _rays(camera)
+    x, y, length, u_x, u_y, v_x, v_y = _rays(camera)
     slope_u, slope_v = _slope(d, 1), _slope(d, 0)
-    A = rays.u_x * slope_u + rays.v_x * slope_v
-    B = rays.u_y * slope_u + rays.v_y * slope_v
-    C = d - A * rays.x - B * rays.y
+    A = u_x * slope_u + v_x * slope_v
+    B = u_y * slope_u + v_y * slope_v
+    C = d - A * x - B * y
     normal = np.sqrt(A * A + B * B + C * C)
-    cosine = np.where(d > 0, d / (np.where(d > 0, normal, 1) * rays.length), 0)
+    cosine = np.where(d > 0, d / (np.where(d > 0, normal, 1) * length), 0)
     return np.arccos(np.minimum(cosine, 1, dtype=np.float32))
 
 
@@ -201,25 +200,13 @@ def mix_edges(z: Float32Array, edge: BoolArray, probability: float, rng: np.rand
     return mixed
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Per pixel (h, w): ray (x, y, 1), its length, and the derivatives of pixel (u, v) by (x, y), px."""
-
-    x: Float32Array
-    y: Float32Array
-    length: Float32Array
-    u_x: Float32Array
-    u_y: Float32Array
-    v_x: Float32Array
-    v_y: Float32Array
-
-
 @lru_cache(maxsize=4)
-def _rays(camera: Camera) -> _Rays:
+def _rays(camera: Camera) -> list[Float32Array]:
+    """Per pixel (h, w): x, y of the ray (x, y, 1), its length, and the pixel's derivatives u_x, u_y, v_x, v_y, px."""
     rays = camera.unproject(camera.pixel_grid())
-    J = camera.project_jacobian(rays)
-    parts = (rays[..., 0], rays[..., 1], np.linalg.norm(rays, axis=-1), J[..., 0, 0], J[..., 0, 1], J[..., 1, 0])
-    return _Rays(*(np.ascontiguousarray(part, np.float32) for part in (*parts, J[..., 1, 1])))
+    J = camera.project_jacobian(rays)[..., :2].reshape(*rays.shape[:2], 4)
+    parts = (*np.moveaxis(rays[..., :2], -1, 0), np.linalg.norm(rays, axis=-1), *np.moveaxis(J, -1, 0))
+    return [np.ascontiguousarray(part, np.float32) for part in parts]
 
 
 def _slope(d: Float32Array, axis: int) -> Float32Array:
