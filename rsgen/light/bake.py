@@ -54,7 +54,7 @@ from rsgen.light.sampling import (
 from rsgen.light.sky import has_sky_light, sky_light
 from rsgen.light.specular_paths import passes_light_on
 from rsgen.light.surface_points import sample_points
-from rsgen.render.irradiance import IrradianceField, Lattice, lattice_area, make_field, make_lattice
+from rsgen.render.irradiance import IrradianceField, Lattice, lattice_area, make_lattice
 
 log = logging.getLogger("rsgen")
 
@@ -191,13 +191,13 @@ def baked_field(
     path = cache / f"irradiance-{key}.npz"
     stored = _load(path, lattice)
     if stored is not None:
-        return make_field(lattice, *stored)
+        return IrradianceField(lattice, *stored)
     with straight_through_bulbs(scene) as glass:
         if glass:
             log.info("lamps in bulbs: their light goes straight through %d shapes of glass", len(glass))
         front, back = bake(scene, lattice, light, progress)
         _store(path, front, back)
-        field = make_field(lattice, front, back)
+        field = IrradianceField(lattice, front, back)
         if view is not None:
             progress("light", 1.0, "how right it is")
             quality = estimated_quality(scene, field, light.texel_m, *view())

@@ -98,7 +98,7 @@ def gathered_caustics(scene: Any, points: SamplePoints, which: IntArray, samples
         p, n, number = at
 
         def light_along(ray: Any, i: Any, pick: Any) -> Any:
-            return dr.pi * caustic_radiance(scene, ray, number, i, pick, mi.Bool(True))
+            return dr.pi * caustic_radiance(scene, ray, number, i, pick)
 
         return about_normal(p, n, number, begin, count, 301, light_along)
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,7 +31,7 @@ from rsgen.light.sampling import (
 )
 from rsgen.light.specular_paths import shines, surface_radiance
 from rsgen.light.surface_points import SamplePoints
-from rsgen.render.irradiance import IrradianceField, Lattice, make_field
+from rsgen.render.irradiance import IrradianceField, Lattice
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
 _BOUNCE_TEXELS = 6.0  # and by all bounces but the last, whose many rays average over what these blur
@@ -61,10 +60,10 @@ class Surfaces:
 
     def field(self, values: NDArray, alive: NDArray[np.bool_]) -> IrradianceField:
         """Irradiance (n, 4), see `in_channels`, of the unique points, as far as they are alive (n,)."""
-        return make_field(self.lattice, *self.sides(values, alive))
+        return IrradianceField(self.lattice, *self.sides(values, alive))
 
     def sides(self, values: NDArray, alive: NDArray[np.bool_]) -> tuple[Float32Array, Float32Array]:
-        """The same as (points, 5) of the lattice's front and back, as `make_field` takes it."""
+        """The same as (points, 5) of the lattice's front and back, as `IrradianceField` takes it."""
         # In half precision, as it is kept: light from the cache must be the same to the last bit.
         share = values[:, 3] / np.maximum(values[:, :3].mean(axis=1), 1e-30)
         share = share.clip(_LEAST_SHARE, _MOST_SHARE).astype(np.float16).astype(np.float32)
@@ -88,7 +87,7 @@ def gathering(scene: Any, field: IrradianceField, points: SamplePoints, which: I
         p, n, number = at
 
         def light_along(ray: Any, i: Any, pick: Any) -> Any:
-            return surface_radiance(scene, field, ray, number, i, pick, follow, mi.Bool(True))
+            return surface_radiance(scene, field, ray, number, i, pick, follow)
 
         return about_normal(p, n, number, begin, count, 101, light_along)
 

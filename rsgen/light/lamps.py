@@ -27,6 +27,7 @@ from rsgen.light.sampling import (
     about_normal,
     in_channels,
     in_halves,
+    interaction,
     part_of,
     r2,
     rotation,
@@ -162,10 +163,7 @@ def _from_emitter(
 
     If that is None, from random ones but the sky.
     """
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    it.t = mi.Float(1)
-    it.n = mi.Normal3f(n)
+    it = interaction(p, n)
     offset = mi.Point2f(rotation(number, 2 * dimension), rotation(number, 2 * dimension + 1))
     # Not part of the program: what is compiled for one lamp serves for all.
     lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else _registry_id(emitter)))
@@ -197,9 +195,7 @@ def _light_share(light_pdf: Any, cosine: Any) -> Any:
 
 def left_to_rays(scene: Any, p: Any, n: Any, follow: bool) -> Callable[[Any, Any, Any], Any]:
     """What rays from p about n bring of the light that `_from_emitter` leaves to them (see `about_normal`)."""
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    it.n = mi.Normal3f(n)
+    it = interaction(p, n)
     any_lamp = len(scene.emitters()) > MANY_EMITTERS
 
     def light_along(ray: Any, _: Any, pick: Any) -> Any:

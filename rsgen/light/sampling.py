@@ -50,6 +50,19 @@ def r2(i: Any, offset: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
+def golden(i: Any, offset: Any) -> Any:
+    """Number i of the sequence in [0, 1) that goes by the golden ratio from `offset` on."""
+    x = offset + mi.Float(i) * 0.6180339887498949
+    return x - dr.floor(x)
+
+
+def interaction(p: Any, n: Any) -> Any:
+    """Interaction3f at points p of normal n."""
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p, it.t, it.n = p, mi.Float(1), mi.Normal3f(n)
+    return it
+
+
 @dr.syntax
 def in_halves(begin, count, light, bit=1):
     """Sums (Vector4f) over two halves of the samples light(i), i from `begin` to `begin + count`, by a bit of i."""
@@ -79,9 +92,7 @@ def about_normal(
 
     def light(i: Any) -> Any:
         d = mi.warp.square_to_cosine_hemisphere(r2(i, offset))
-        pick = lobe + mi.Float(i) * 0.6180339887498949
-        pick -= dr.floor(pick)
-        return in_channels(light_along(mi.Ray3f(p, frame.to_world(d)), i, pick), d.z)
+        return in_channels(light_along(mi.Ray3f(p, frame.to_world(d)), i, golden(i, lobe)), d.z)
 
     return in_halves(begin, count, light)
 

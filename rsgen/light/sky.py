@@ -16,7 +16,18 @@ import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.sampling import chunks, in_channels, in_halves, r2, rotation, sampled_adaptively, sampler_at, thin
+from rsgen.light.sampling import (
+    chunks,
+    golden,
+    in_channels,
+    in_halves,
+    interaction,
+    r2,
+    rotation,
+    sampled_adaptively,
+    sampler_at,
+    thin,
+)
 from rsgen.light.specular_paths import first_scatterer, passes_light_on
 from rsgen.light.surface_points import SamplePoints
 
@@ -72,7 +83,7 @@ def _learned(
         here = cell[coarse[first : first + len(part)]]
         bins = np.repeat(here * BINS, _FIRST_LOOK_SAMPLES) + np.array(found[0])
         np.add.at(seen.reshape(-1), bins, np.array(found[1]))  # much faster by one index than by two
-    return Guide.learned(seen)
+    return Guide(seen)
 
 
 def _first_look(scene: Any, p: Any, n: Any, number: Any, follow: bool) -> tuple[Any, Any]:
@@ -96,8 +107,7 @@ def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, guided: Any) -> tuple
     """
     about = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(u))
     own, sky = about, scene.environment()
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p, it.t, it.n = p, mi.Float(1), mi.Normal3f(n)
+    it = interaction(p, n)
     if sky is not None:
         own = sky.sample_direction(it, u)[0].d
     d = dr.select(other, about if guided is None else guided[0], own)
@@ -112,7 +122,7 @@ def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, guided: Any) -> tuple
 def _arriving(scene: Any, p: Any, n: Any, d: Any, pick: Any, follow: bool) -> tuple[Any, Any]:
     """Whether anything arrives at p (normal n) from direction d, and radiance times cosine."""
     cosine = dr.dot(n, d)
-    _, si, _, through, turned = first_scatterer(scene, mi.Ray3f(p, d), pick - dr.floor(pick), follow, cosine > 0)
+    _, si, _, through, turned = first_scatterer(scene, mi.Ray3f(p, d), pick, follow, cosine > 0)
     emitter = si.emitter(scene)
     found = (cosine > 0) & (emitter != dr.zeros(mi.EmitterPtr)) & (~si.is_valid() | turned)
     return found, dr.select(found, through * emitter.eval(si, found) * cosine, 0)
@@ -129,7 +139,7 @@ def _sky_at(
         u = r2(i >> 1, offset)
         guided = (guide.sample(cell, u), lambda d: guide.density(cell, d))
         d, density = _drawn(scene, p, n, u, (i & 1) == 1, guided)
-        found, brought = _arriving(scene, p, n, d, lobe + mi.Float(i) * 0.6180339887498949, follow)
+        found, brought = _arriving(scene, p, n, d, golden(i, lobe), follow)
         return in_channels(dr.select(found & (density > 0), brought / dr.maximum(density, 1e-20), 0), dr.dot(n, d))
 
     return in_halves(begin, samples, light, bit=2)  # of each two one is the sky's own and one guided
@@ -138,18 +148,14 @@ def _sky_at(
 class Guide:
     """Densities of directions for each cell; no dataclass, which Dr.Jit's loops would take apart as their state."""
 
-    def __init__(self, cumulative: Any) -> None:
-        """cumulative: Float, for each cell its bins' distribution function, the last being 1."""
-        self.cumulative = cumulative
-
-    @classmethod
-    def learned(cls, seen: Float32Array) -> Guide:
-        """From the light (cells, BINS) that samples, drawn evenly, have brought from each bin."""
+    def __init__(self, seen: Float32Array) -> None:
+        """Learned from the light (cells, BINS) that samples, drawn evenly, have brought from each bin."""
         cumulative = np.empty_like(seen)
         for begin in range(0, len(seen), _GUIDE_CHUNK):
             part = slice(begin, begin + _GUIDE_CHUNK)
             cumulative[part] = _distribution(seen[part].reshape(-1, _ALONG, _AROUND).astype(np.float64))
-        return cls(mi.Float(aligned(cumulative)))
+        # Of each cell its bins' distribution function, the last being 1.
+        self.cumulative = mi.Float(aligned(cumulative))
 
     def sample(self, cell: Any, u: Any) -> Any:
         """A direction (Vector3f, world frame) in each cell, by two uniform numbers."""

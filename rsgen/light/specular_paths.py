@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from rsgen.light.sampling import golden
 from rsgen.scene.rays import proper
 
 # Panes and mirrors that a ray is followed through: a double-glazed window seen in a mirror has nine.
@@ -63,8 +64,7 @@ def first_scatterer(scene, ray, pick, follow, active):
             going &= pi.is_valid() & (passed < _MOST) & ((kind & _STRAIGHT) != 0)
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, going)
             bsdf = si.bsdf(ray)
-            u = pick + mi.Float(passed) * 0.6180339887498949
-            u -= dr.floor(u)
+            u = golden(passed, pick)
             bs, weight = bsdf.sample(context, si, u, mi.Point2f(u, 0.5), going)
             straight_on = (bs.sampled_type & _NULL) != 0
             going &= straight_on | (((bs.sampled_type & _STRAIGHT) != 0) & ((kind & _DIFFUSE) == 0))
@@ -81,7 +81,7 @@ def first_scatterer(scene, ray, pick, follow, active):
 
 
 @dr.syntax
-def surface_radiance(scene, field, ray, number, i, pick, follow, active):
+def surface_radiance(scene, field, ray, number, i, pick, follow):
     """Radiance times π (Color3f) that matte surfaces send along a ray, lit as `field` states.
 
     With `follow` by way of whatever mirrors or lets through, which of a surface's lobes by lot; without, the first
@@ -92,7 +92,7 @@ def surface_radiance(scene, field, ray, number, i, pick, follow, active):
     light = mi.Color3f(0)
     through = mi.Color3f(1)
     passed = mi.UInt32(0)
-    going = mi.Bool(active)
+    going = mi.Bool(True)
     while going:
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=going)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, going)
@@ -109,13 +109,12 @@ def surface_radiance(scene, field, ray, number, i, pick, follow, active):
         ray = si.spawn_ray(si.to_world(bs.wo))
         going = onward
         passed += 1
-        pick += 0.6180339887498949
-        pick -= dr.floor(pick)
+        pick = golden(1, pick)
     return light
 
 
 @dr.syntax
-def caustic_radiance(scene, ray, number, i, pick, active):
+def caustic_radiance(scene, ray, number, i, pick):
     """Radiance (Color3f) of lamps and sky that comes along a ray by way of lacquer or brushed metal.
 
     Arguments as of `surface_radiance`. What brushed metal blurs is found by sampling lamps and lobe, with the balance
@@ -130,7 +129,7 @@ def caustic_radiance(scene, ray, number, i, pick, active):
     blurred = mi.Bool(False)  # at the last turn, by a lobe of this density, there
     density = mi.Float(1)
     there = dr.zeros(mi.Interaction3f, dr.width(ray.o))
-    going = mi.Bool(active)
+    going = mi.Bool(True)
     while going:
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=going)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, going)
@@ -159,8 +158,7 @@ def caustic_radiance(scene, ray, number, i, pick, active):
         there = mi.Interaction3f(si)
         ray = si.spawn_ray(si.to_world(bs.wo))
         passed += 1
-        pick += 0.6180339887498949
-        pick -= dr.floor(pick)
+        pick = golden(1, pick)
     return light
 
 

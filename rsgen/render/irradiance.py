@@ -57,10 +57,6 @@ class Lattice:
         row, column = np.divmod(np.arange(self.points) - self.first[face], self.cells[face, 1] + 1)
         return face, row, column
 
-    def packed(self) -> NDArray[np.uint32]:
-        """(f,) cells and apex of each triangle in one word for the device."""
-        return (self.cells[:, 0] | self.cells[:, 1] << 12 | self.apex << 24).astype(np.uint32)
-
 
 def registry_id(shape: Any) -> int:
     """Dr.Jit's number of a shape, which a `ShapePtr` on the device holds."""
@@ -197,20 +193,29 @@ class IrradianceField:
     beyond a wall, or under what lies on the surface, does not count on this side of it (see `packed_reach`).
     """
 
-    def __init__(
-        self, shape_first: Any, lacquered: Any, faces: Any, values: Any, share: Any, face_count: int
-    ) -> None:  # fmt: skip
-        """`shape_first` Int32 and `lacquered` UInt32 (0, 1) by registry id; `faces` UInt32 pairs (first point, packed
-        cells and apex), front sides then back sides; per lattice point of each stored side `values` Float, (E_r, E_g,
-        E_b, w): w is 0 for a point that is not alive, else 1 + its reach; and `share` Float, beneath lacquer (see
-        `light.bake`).
+    def __init__(self, lattice: Lattice, front: Float32Array, back: Float32Array) -> None:
+        """front, back: of each lattice point (points, 5): E_r, E_g, E_b (scene units); 0 for a point that is not alive,
+        else 1 + its reach; and its share beneath lacquer (see `light.bake`). Without a fifth column that is 1.
+
+        Tables: faces has pairs (first point, packed cells and apex), front sides then back sides. Unlit back sides
+        share one dark cell.
         """
-        self.shape_first = shape_first
-        self.lacquered = lacquered
-        self.faces = faces
-        self.values = values
-        self.share = share
-        self.back_first = dr.opaque(mi.UInt32, face_count)  # else kernels are compiled for each number of triangles
+        counts, packed = lattice.counts, lattice.cells[:, 0] | lattice.cells[:, 1] << 12 | lattice.apex << 24
+        lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
+        dark = lattice.points  # four zero entries follow the front values
+        of_back = np.where(lit, counts, 0)
+        back_first = np.where(lit, dark + 4 + np.cumsum(of_back) - of_back, dark)
+        back_packed = np.where(lit, packed, 1 | 1 << 12)
+        first, both = np.concatenate([lattice.first, back_first]), np.concatenate([packed, back_packed])
+        parts = front, np.zeros((4, front.shape[1]), np.float32), back[np.repeat(lit, counts)]
+        # One after the other: each is copied twice on its way to the device.
+        self.values = mi.Float(aligned(np.concatenate([part[:, :4] for part in parts])))
+        shares = [part[:, 4] if front.shape[1] == 5 else np.ones(len(part)) for part in parts]
+        self.share = mi.Float(aligned(np.concatenate(shares)))
+        self.shape_first = mi.Int32(aligned(lattice.shape_first, np.int32))  # by registry id
+        self.lacquered = mi.UInt32(aligned(lattice.lacquered, np.uint32))  # likewise
+        self.faces = mi.UInt32(aligned(np.stack([first, both], axis=1), np.uint32))
+        self.back_first = dr.opaque(mi.UInt32, len(lattice.first))  # else kernels are made for each number of triangles
 
     def beneath_lacquer(self, shape: Any, active: Any) -> Any:
         """Whether what is matte of a shape (ShapePtr) is lit by what gets into lacquer."""
@@ -259,32 +264,3 @@ class IrradianceField:
 def _reach(code: Any) -> Any:
     """Part of the way to the neighbour, above 1 where it is free."""
     return mi.Float(FREE - (code & 31)) / (REACH_LEVELS - 1)
-
-
-def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> IrradianceField:
-    """Upload values (points, 4 or 5) of both sides, as `IrradianceField` has them, in the fifth column each one's share
-    (none: 1); unlit back sides share one dark cell.
-    """
-    packed = lattice.packed()
-    lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
-    keep = np.repeat(lit, lattice.counts)
-    counts = np.where(lit, lattice.counts, 0)
-    dark = lattice.points  # four zero entries follow the front values
-    back_first = np.where(lit, dark + 4 + np.cumsum(counts) - counts, dark)
-    back_packed = np.where(lit, packed, np.uint32(1 | 1 << 12))
-    faces = np.stack(
-        [np.concatenate([lattice.first, back_first]), np.concatenate([packed, back_packed])], axis=1
-    ).astype(np.uint32)
-    parts = front, np.zeros((4, front.shape[1]), np.float32), back[keep]
-    # One after the other: each is copied twice on its way to the device.
-    values = mi.Float(aligned(np.concatenate([part[:, :4] for part in parts])))
-    has_share = front.shape[1] == 5
-    share = mi.Float(aligned(np.concatenate([part[:, 4] if has_share else np.ones(len(part)) for part in parts])))
-    return IrradianceField(
-        mi.Int32(aligned(lattice.shape_first, np.int32)),
-        mi.UInt32(aligned(lattice.lacquered, np.uint32)),
-        mi.UInt32(aligned(faces, np.uint32)),
-        values,
-        share,
-        len(lattice.first),
-    )
