@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -266,12 +267,17 @@ def tessellated(mi: Any, props: Any, file: Path) -> Any:
     if mirrored != turned:
         faces = faces[:, ::-1]
     file.write_bytes(ply_bytes(position @ to_world[:3, :3].T + to_world[:3, 3], faces, normal, uv))
+    return as_ply(mi, props, file, ("to_world", "center", "radius", "p0", "p1", "flip_normals"))
+
+
+def as_ply(mi: Any, props: Any, file: Path, left_out: Collection[str] = ()) -> Any:
+    """The properties of a shape, but for some, whose triangles are in a PLY file."""
     out = mi.Properties("ply")
     out.set_id(props.id())
-    out["filename"] = str(file)
     for key in props.keys():  # noqa: SIM118 (Mitsuba's Properties is no dict)
-        if key not in ("to_world", "center", "radius", "p0", "p1", "flip_normals"):
+        if key not in left_out:
             out[key] = props[key]
+    out["filename"] = str(file)
     return out
 
 
