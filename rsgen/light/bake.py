@@ -1,7 +1,7 @@
 """A scene's diffuse irradiance: from the cache if it was baked with the same inputs before, else baked now and stored.
 
 1. Every point of `irradiance.Lattice` gets direct light, by emitter sampling: from each lamp (`lamps`), from the sky
-   and off mirrors (`sky`), and off lacquer and brushed metal (`caustics`). Both sides of each triangle have points;
+   and off mirrors (`sky`), and off lacquer and brushed metal (`specular`). Both sides of each triangle have points;
    points that coincide are one. Where a mesh is finer than the texel, a thinned set of points is computed and the
    others are interpolated.
 2. Indirect light varies slowly, so it is gathered over bounces at a still thinner set, a few texels apart (`indirect`).
@@ -36,7 +36,6 @@ from rsgen.config.config import LightConfig
 from rsgen.console.configs import user_cache
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rsgen.light.caustics import caustic_light
 from rsgen.light.indirect import Surfaces, gathering, light_off_surfaces
 from rsgen.light.lamps import first_look, lamp_light, straight_through_bulbs
 from rsgen.light.quality import estimated_quality
@@ -52,7 +51,7 @@ from rsgen.light.sampling import (
     typical,
 )
 from rsgen.light.sky import has_sky_light, sky_light
-from rsgen.light.specular_paths import passes_light_on
+from rsgen.light.specular import caustic_light, passes_light_on
 from rsgen.light.surface_points import sample_points
 from rsgen.render.irradiance import IrradianceField, Lattice, lattice_area, make_lattice
 

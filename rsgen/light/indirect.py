@@ -29,7 +29,7 @@ from rsgen.light.sampling import (
     thin,
     visible_error,
 )
-from rsgen.light.specular_paths import shines, surface_radiance
+from rsgen.light.specular import shines, surface_radiance
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import IrradianceField, Lattice
 

@@ -34,7 +34,7 @@ from rsgen.light.sampling import (
     sampled_adaptively,
     sampler_at,
 )
-from rsgen.light.specular_paths import first_scatterer, transmitted
+from rsgen.light.specular import first_scatterer, transmitted
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import registry_id
 from rsgen.scene.rays import RAY_OFFSET_M

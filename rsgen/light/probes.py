@@ -16,7 +16,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
 from rsgen.light.sampling import golden, r2
-from rsgen.light.specular_paths import first_scatterer, passes_light_on, transmitted
+from rsgen.light.specular import first_scatterer, passes_light_on, transmitted
 from rsgen.render.irradiance import IrradianceField
 from rsgen.scene.moving_objects import HARMONICS, harmonics, irradiance_coefficients
 

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from rsgen import srgb
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.device.arrays import rows_of
-from rsgen.light.caustics import gathered_caustics
 from rsgen.light.indirect import gathering
 from rsgen.light.lamps import lamp_light
 from rsgen.light.sampling import typical
 from rsgen.light.sky import LESS, has_sky_light, sky_light
-from rsgen.light.specular_paths import first_scatterer, passes_light_on, shines
+from rsgen.light.specular import first_scatterer, gathered_caustics, passes_light_on, shines
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import IrradianceField
 from rsgen.scene.rays import rays_from

@@ -28,7 +28,7 @@ from rsgen.light.sampling import (
     sampler_at,
     thin,
 )
-from rsgen.light.specular_paths import first_scatterer, passes_light_on
+from rsgen.light.specular import first_scatterer, passes_light_on
 from rsgen.light.surface_points import SamplePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface

@@ -14,8 +14,8 @@ from rendering import constant_twist, dr, mi
 from rsgen.device.arrays import rows_of, vectors
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.light.caustics import gathered_caustics
 from rsgen.light.indirect import gathering
+from rsgen.light.specular import gathered_caustics
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
