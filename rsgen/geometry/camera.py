@@ -19,6 +19,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.polynomial import polyval
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
@@ -80,7 +81,7 @@ class Camera:
             raise UserError(
                 f"camera: {self.model} takes {counts} finite distortion coefficients, not {self.distortion}"
             )
-        if self.model == "double_sphere" and not lens.is_double_sphere(*self.distortion):
+        if self.model == "double_sphere" and not (-1.0 < self._sphere[0] <= 1.0 and 0.0 <= self._sphere[1] <= 1.0):
             raise UserError(f"camera: double_sphere takes xi in (-1, 1] and alpha in [0, 1], not {self.distortion}")
 
     @property
@@ -220,7 +221,7 @@ class Camera:
         theta = np.arctan(r)
         safe_r2 = np.where(r2 > 0.0, r2, 1.0)
         s = np.where(r2 > 0.0, lens.odd(self.distortion, theta) / np.sqrt(safe_r2), 1.0)
-        slope = lens.horner(lens.odd_slope(self.distortion), theta * theta)
+        slope = polyval(theta * theta, lens.odd_slope(self.distortion))
         # g only ever multiplies products of x and y, so what cancels here for small r does no harm.
         return s, np.where(r2 > 0.0, (slope / (1.0 + r2) - s) / safe_r2, 0.0)
 

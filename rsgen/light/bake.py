@@ -135,7 +135,7 @@ def _direct(
     alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.55, 0.05, "finding lit surfaces"))
     if not alive.any():
         raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
-    fine, patch, means = fine[alive], _renumbered(patch[alive]), means[:, alive]
+    fine, patch, means = fine[alive], np.unique(patch[alive], return_inverse=True)[1].ravel(), means[:, alive]
     noisy = np.flatnonzero(np.hypot(left, left_of_lamps)[alive] > part)
     direct = denoised(points, fine, means, standard_error(patch, means), light.texel_m, noisy)
     return direct + off_lacquer[alive], alive
@@ -160,10 +160,6 @@ def _reached(
 
 def _summed(label: IntArray, values: FloatArray) -> FloatArray:
     return np.bincount(label, values).astype(np.float64)
-
-
-def _renumbered(label: IntArray) -> IntArray:
-    return np.unique(label, return_inverse=True)[1].ravel()
 
 
 def _as_db(left: FloatArray) -> float:

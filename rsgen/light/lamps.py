@@ -145,10 +145,6 @@ def _kinds(scene: Any) -> list[tuple[Any, int, bool]]:
     return [(lamp, k, int(lamp.flags()) & int(mi.EmitterFlags.Delta) != 0) for k, lamp in enumerate(lamps)]
 
 
-def _registry_id(emitter: Any) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
-
-
 def _draw(scene: Any, emitter: Any, dimension: int, points: SamplePoints, which: IntArray, follow: bool) -> Any:
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
         return _from_emitter(scene, emitter, *at, begin, count, dimension, follow)
@@ -166,7 +162,7 @@ def _from_emitter(
     it = interaction(p, n)
     offset = mi.Point2f(rotation(number, 2 * dimension), rotation(number, 2 * dimension + 1))
     # Not part of the program: what is compiled for one lamp serves for all.
-    lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else _registry_id(emitter)))
+    lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else registry_id(emitter)))
 
     def light(i: Any) -> Any:
         u = r2(i, offset)

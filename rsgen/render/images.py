@@ -220,7 +220,8 @@ class PixelSamples:
     def __init__(self, count: int, dimensions: int) -> None:
         points = qmc.Sobol(dimensions, scramble=False, bits=_BITS).random_base2(max(0, (count - 1).bit_length()))
         bits = np.ldexp(points, _BITS).astype(np.uint32)
-        self.table = [mi.UInt32(aligned(_reversed(column), np.uint32)) for column in bits.T]
+        self.table = [dr.brev(mi.UInt32(aligned(column, np.uint32))) for column in bits.T]
+        dr.eval(self.table)
 
     def at(self, sample: Any, pixel: Any, key: Any, first: int, dimensions: int) -> list[Any]:
         """Uniform numbers (Float) of samples of pixels, both UInt32: `dimensions` from `first` on; key: UInt32."""
@@ -231,9 +232,3 @@ class PixelSamples:
                 bits ^= bits * multiplier
             numbers.append(mi.Float(dr.brev(bits) >> 8) * 2.0**-24)
         return numbers
-
-
-def _reversed(bits: Any) -> Any:
-    """uint32 (n,) with their bits in the opposite order."""
-    as_bits = np.unpackbits(bits.astype("<u4").view(np.uint8).reshape(-1, 4), axis=1, bitorder="little")
-    return np.packbits(as_bits[:, ::-1], axis=1, bitorder="little").view("<u4")[:, 0]

@@ -58,9 +58,10 @@ class Lattice:
         return face, row, column
 
 
-def registry_id(shape: Any) -> int:
-    """Dr.Jit's number of a shape, which a `ShapePtr` on the device holds."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+def registry_id(thing: Any) -> int:
+    """Dr.Jit's number of a shape or an emitter, which a pointer to it on the device holds."""
+    pointer = mi.EmitterPtr if isinstance(thing, mi.Emitter) else mi.ShapePtr
+    return int(dr.reinterpret_array(mi.UInt32, pointer(thing))[0])
 
 
 def make_lattice(scene: Any, spacing: float) -> Lattice:
