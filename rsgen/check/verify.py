@@ -25,13 +25,7 @@ from rsgen.files import is_temporary, read_text
 from rsgen.geometry import se3
 from rsgen.produce.records import fingerprint
 from rsgen.sensors.reports import reported_poses, sequence_mocap
-from rsgen.sequence.format import (
-    STAMP_TOLERANCE_S,
-    STREAMS,
-    associate,
-    line_poses,
-    pose_rows,
-)
+from rsgen.sequence.format import STAMP_TOLERANCE_S, STREAMS, associate, line_poses, pose_rows
 from rsgen.sequence.images import COLOR_DEPTH, ImageStream, Rig, Sequence
 from rsgen.sequence.reader import read_rig
 

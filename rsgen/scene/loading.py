@@ -33,7 +33,6 @@ from rsgen.inputs import check_input
 from rsgen.scene.meshes import meshes_of, ply_bytes, repair_meshes, split_terrain
 from rsgen.scene.placement import ANALYTIC, AS_IT_IS, SceneOptions, place, place_lamps, tessellated, turn_mirrored
 from rsgen.scene.xml_scene import (
-    Parsed,
     check_files,
     explained,
     log_renamed,
@@ -110,8 +109,7 @@ def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
     else:
         mi = mitsuba()
         with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi), _faults_of(path):
-            parsed = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
-        state, changes = parsed.state, parsed.changes
+            state, changes, _ = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
         if changes is not None:
             digest.update(xml_helper("older version").METHOD)
         if options != replace(AS_IT_IS, skip_missing=options.skip_missing):
@@ -150,14 +148,14 @@ def _load_xml(
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
     config.merge_meshes = False
-    parsed = parse(mi, config, path, scratch, None if board is None else board_xml(board, scratch))
-    changes = parsed.changes
-    log_renamed(path, parsed.renamed)
+    shape = None if board is None else board_xml(board, scratch)
+    state, changes, renamed = parse(mi, config, path, scratch, shape)
+    log_renamed(path, renamed)
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
     try:
         with _threads_to_read_with():
-            scene = _instantiated(mi, config, parsed, path, scratch, options)
+            scene = _instantiated(mi, config, state, changes is not None, path, scratch, options)
     finally:
         del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
     if changes is not None:
@@ -181,8 +179,9 @@ def _threads_to_read_with() -> Iterator[None]:
             dr.set_thread_count(before)
 
 
-def _instantiated(mi: Any, config: Any, parsed: Parsed, path: Path, scratch: Path, options: SceneOptions) -> Any:
-    state = parsed.state
+def _instantiated(
+    mi: Any, config: Any, state: Any, upgraded: bool, path: Path, scratch: Path, options: SceneOptions
+) -> Any:
     prepare(mi, config, state, path)
     if options != AS_IT_IS:
         place(mi, state, path, options, BOARD_ID)
@@ -197,7 +196,7 @@ def _instantiated(mi: Any, config: Any, parsed: Parsed, path: Path, scratch: Pat
     check_files(mi, state, path, options.skip_missing)
     if any(node.type == mi.ObjectType.Shape and node.props.plugin_name() == "obj" for node in state.nodes):
         xml_helper("mesh files").read_polygons(mi, state, scratch)
-    if parsed.changes is not None:
+    if upgraded:
         xml_helper("older version").multiply_images(mi, state)
     mi.parser.transform_all(config, state)
     untouched = mi.parser.ParserState(state)  # objects made of it, also by an attempt that fails, stay in the other
