@@ -38,7 +38,7 @@ def save(figure: Figure, path: Path) -> None:
 
 def bare_axes(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
     """A figure of this size, inches, and its axes (rows, columns), which have no ticks."""
-    bare = {"xticks": [], "yticks": []}
+    bare: dict[str, Any] = {"xticks": [], "yticks": []}
     return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, subplot_kw=bare)
 
 

@@ -147,7 +147,8 @@ def _kinds(scene: Any) -> list[tuple[Any, int, bool]]:
 
 def _draw(scene: Any, emitter: Any, dimension: int, points: SamplePoints, which: IntArray, follow: bool) -> Any:
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
-        return _from_emitter(scene, emitter, *at, begin, count, dimension, follow)
+        p, n, number = at
+        return _from_emitter(scene, emitter, p, n, number, begin, count, dimension, follow)
 
     return sampler_at(points, which, sample)
 

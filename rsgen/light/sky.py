@@ -65,7 +65,8 @@ def sky_light(
     guide = _learned(scene, points, which, cell, texel_m, follow)
 
     def sample(at: Sequence[Any], here: IntArray, begin: int, count: int) -> Any:
-        return _sky_at(scene, guide, mi.UInt32(aligned(cell[here], np.uint32)), *at, begin, count, follow)
+        p, n, number = at
+        return _sky_at(scene, guide, mi.UInt32(aligned(cell[here], np.uint32)), p, n, number, begin, count, follow)
 
     draw = sampler_at(points, which, sample)
     first, rounds = max(4, samples // LESS), _ROUNDS_OF_LAMPS if scene.environment() is None else _ROUNDS

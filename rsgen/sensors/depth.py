@@ -90,7 +90,7 @@ def smooth_field(shape: tuple[int, ...], length_px: float, rng: np.random.Genera
     return smooth[margin:-margin, margin:-margin] * np.float32(2 * np.sqrt(np.pi) * sigma)
 
 
-def disparity(z: Float32Array, focal_baseline: float) -> Float32Array:
+def disparity(z: Float32Array, focal_baseline: float | np.float32) -> Float32Array:
     """Disparity (h, w) in px of planar depth z (h, w) in m, `focal_baseline` in m·px (a Kinect's: 43); 0 of 0.
 
     Depth of disparity likewise.
