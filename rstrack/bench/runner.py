@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
-from rsgen.console.scheduler import DaskWorkers, Workers
+from rsgen.console.scheduler import Workers
 from rsgen.device.backend import select
 from rsgen.errors import UserError
 from rstrack.bench.cells import Benchmark, Cell
@@ -114,7 +114,7 @@ def run_cells(
         show(f"{name} {note}")
 
     try:
-        if isinstance(workers, DaskWorkers):
+        if workers is not None and type(workers) is not Workers:  # elsewhere
             _render(todo, progress)
         for k, record in (workers or Workers()).apply(run_cell, todo, report):
             records[record.cell] = record
