@@ -21,7 +21,7 @@ Storage = Literal["sqlite3", "mcap"]
 
 def info(sequence: SequenceFolder) -> int:
     """Say what a sequence folder holds."""
-    from rsgen.sequence.info import sequence_info
+    from rsgen.sequence.reader import sequence_info
 
     print(sequence_info(sequence))
     return 0

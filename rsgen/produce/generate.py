@@ -31,8 +31,7 @@ from rsgen.produce.parts import (
 )
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Reading, Setting, adapt
-from rsgen.sequence.labels import LABELS, labels_yaml, thing_of
-from rsgen.sequence.truth_files import mesh_file
+from rsgen.sequence.truth_files import LABELS, labels_yaml, mesh_file, thing_of
 
 # What a sequence folder remembers of the machine that rendered it, for commands that render again. Not part of the
 # format: a sequence is whole without it.

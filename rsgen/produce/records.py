@@ -35,19 +35,21 @@ from rsgen.sensors.reports import deliver, reported_poses
 from rsgen.sequence.camera_yaml import Cameras
 from rsgen.sequence.format import (
     CLEAN_COLOR,
+    FILES,
     FORMAT,
     OBJECT_CHANNELS,
     OBJECT_IDS,
     RIG_FORMAT,
     STREAMS,
+    StreamFiles,
     associate,
     frame_name,
     ground_truth,
     line_poses,
     pose_lines,
+    rig_files,
     round_stamps,
 )
-from rsgen.sequence.stream_files import FILES, StreamFiles, rig_files
 from rsgen.sequence.truth_files import FrameTable
 
 

@@ -41,8 +41,7 @@ from rsgen.sequence.format import (
     line_poses,
     pose_lines,
 )
-from rsgen.sequence.labels import boxes_text
-from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, spline_file, target_corners_text
+from rsgen.sequence.truth_files import TARGET_CORNERS, boxes_text, poses_file, spline_file, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
 

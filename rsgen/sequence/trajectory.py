@@ -32,7 +32,7 @@ MAX_POSITION_M = 1e4
 MIN_POSES = 4
 _MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
 _ICL_Z_OFFSET_M = -2.25  # the published files put frame 1 at z = -2.25
-_FIELDS = {"tum": 8, "icl": 8, "euroc": 8}
+_FIELDS = 8
 _LAYOUT = {
     "tum": "'stamp tx ty tz qx qy qz qw'",
     "icl": "'frame tx ty tz qx qy qz qw'",
@@ -191,14 +191,13 @@ def _detect(path: Path, records: list[tuple[int, str]]) -> Literal["tum", "icl",
 
 def _table(path: Path, kind: str, records: list[tuple[int, str]]) -> FloatArray:
     """(n, 8) float64: the first eight columns."""
-    wanted = _FIELDS[kind]
     rows = []
     for line, content in records:
         fields = content.split(",") if kind == "euroc" else content.replace(",", " ").split()
-        if len(fields) < wanted or (len(fields) > wanted and kind != "euroc"):
-            raise UserError(f"{path}:{line}: {len(fields)} columns instead of {wanted}, expected {_LAYOUT[kind]}")
+        if len(fields) < _FIELDS or (len(fields) > _FIELDS and kind != "euroc"):
+            raise UserError(f"{path}:{line}: {len(fields)} columns instead of {_FIELDS}, expected {_LAYOUT[kind]}")
         try:
-            rows.append([float(field) for field in fields[:wanted]])
+            rows.append([float(field) for field in fields[:_FIELDS]])
         except ValueError:
             bad = next(field for field in fields if not _is_number(field))
             raise UserError(f"{path}:{line}: '{bad.strip()[:30]}' is not a number, expected {_LAYOUT[kind]}") from None
