@@ -35,10 +35,8 @@ from rsgen.produce.generate import ORIGIN, render_sequence
 from rsgen.produce.parts import LoadedScene, load_scene_and_light
 from rsgen.produce.records import fingerprint
 from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
-from rsgen.suite.definition import FORMAT, SUITE, Definition, Planned
-from rsgen.suite.listing import estimate
+from rsgen.suite.definition import FORMAT, SUITE, Definition, Planned, RenderOptions, estimate
 from rsgen.suite.manifest import MANIFEST, FileRecord, read_manifest, record_files, rule_of, sha256_of, write_manifest
-from rsgen.suite.options import RenderOptions
 
 log = logging.getLogger("rsgen")
 
