@@ -16,7 +16,8 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
 from rsgen.motion.clearance import check_clearance
 from rsgen.motion.object_paths import check_objects_clear
-from rsgen.produce.frame_source import FrameSource, render_shots
+from rsgen.produce.camera_sources import FrameSource, render_shots
+from rsgen.produce.distribute import render_blocks
 from rsgen.produce.parts import (
     LoadedScene,
     TrueMotion,
@@ -76,8 +77,6 @@ def render_sequence(
         write_ply(mesh.vertices, mesh.faces, out / mesh_file(thing.name))
     try:
         if todo and workers is not None:
-            from rsgen.produce.distribute import render_blocks  # on workers `render_shots` renders, too
-
             render_blocks(writer, todo, *identity, workers, progress)
         elif todo:
             source = source or open_frames(config, progress, scene=scene, objects=writer.objects, loaded=loaded)

@@ -26,8 +26,7 @@ from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion, with_tremor
 from rsgen.motion.object_paths import object_spline
 from rsgen.motion.stretch import along, cut
-from rsgen.produce.camera_sources import Stage
-from rsgen.produce.frame_source import FrameSource
+from rsgen.produce.camera_sources import FrameSource, Stage
 from rsgen.produce.records import fingerprint
 from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import Trajectory, read_trajectory

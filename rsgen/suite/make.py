@@ -30,7 +30,7 @@ from rsgen.files import (
     remove_stale_temporaries,
     write_error,
 )
-from rsgen.produce.batches import by_scene
+from rsgen.produce.distribute import by_scene, for_other_processes, loaded_last
 from rsgen.produce.generate import ORIGIN, render_sequence
 from rsgen.produce.parts import LoadedScene, load_scene_and_light
 from rsgen.produce.records import fingerprint
@@ -139,10 +139,6 @@ def _lit(config: Config) -> list[Any]:
     return [config.scene, config.light, *([config.target] if config.target else [])]
 
 
-# Scene and light that this process rendered last, by what they were made from.
-_loaded: dict[str, LoadedScene] = {}
-
-
 def _loaded_scene(job: SuiteJob, progress: Progress) -> LoadedScene | None:
     """None where things move: their light is made for each sequence."""
     config = job.planned.config
@@ -150,10 +146,7 @@ def _loaded_scene(job: SuiteJob, progress: Progress) -> LoadedScene | None:
         return None
     view = config.cameras[config.view]
     key = job.key + str(view.spp if isinstance(view, ColorConfig) else 1)
-    if key not in _loaded:
-        _loaded.clear()
-        _loaded[key] = load_scene_and_light(config, progress)
-    return _loaded[key]
+    return loaded_last(key, lambda: load_scene_and_light(config, progress))
 
 
 def _stated_cameras(config: Config) -> dict[str, Any]:
@@ -167,9 +160,7 @@ def _stated_cameras(config: Config) -> dict[str, Any]:
 
 
 def _job(one: Planned, out: Path, truth: Path | None) -> SuiteJob:
-    config = one.config
-    scene = config.scene.model_copy(update={"file": config.scene.file.resolve()})  # for other processes
-    one = Planned(one.name, one.entry, config.model_copy(update={"scene": scene}))
+    one = Planned(one.name, one.entry, for_other_processes(one.config))
     held = None if truth is None or one.entry.role != "test" else (truth / one.name).resolve()
     return SuiteJob(one, (out / one.name).resolve(), (out / _DONE / f"{one.name}.json").resolve(), held)
 
