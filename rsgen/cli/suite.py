@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rsgen.console.command_line import Quiet
+from rsgen.console.progress import ProgressDisplay
 from rsgen.console.scheduler import Scheduler, open_workers
 from rsgen.suite.definition import RenderOptions, describe_suite, read_definition, suites_folder
 
@@ -35,7 +36,6 @@ def render(
     that is stopped, or killed, goes on with the same command, to the same bytes. --scheduler local:2 renders two
     sequences at a time.
     """
-    from rsgen.console.progress import ProgressDisplay
     from rsgen.suite.make import render_suite
 
     with ProgressDisplay(quiet) as progress, open_workers(scheduler) as workers:

@@ -13,7 +13,7 @@ from rsgen.array_types import FloatArray
 from rsgen.config.motion import Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.motion.paths import TourCurve
+from rsgen.motion.make import TourCurve
 
 _STEP_S = 0.02
 _STEP_M = 0.02

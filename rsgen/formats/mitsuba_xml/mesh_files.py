@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import first_few
 from rsgen.formats.meshes.mesh_file import from_srgb, given_normals
-from rsgen.formats.polygons import is_convex, triangulated
+from rsgen.formats.meshes.parts import is_convex, triangulated
 from rsgen.scene.meshes import joined_triangles, ply_bytes
 
 _OBJ_METHOD = b"obj-polygons/2"

@@ -10,8 +10,7 @@ import numpy as np
 import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
-from rsgen.formats.meshes.parts import Part
-from rsgen.formats.polygons import triangulate
+from rsgen.formats.meshes.parts import Part, triangulate
 from rsgen.formats.scenes.content import Notes
 from rsgen.formats.scenes.usd_material import BoundMaterial
 from rsgen.scene.material import Material

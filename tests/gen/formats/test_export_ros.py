@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections import defaultdict
 from dataclasses import replace
@@ -16,7 +17,6 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
-from rsgen.formats.export import bag
 from rsgen.formats.export.ros import export_ros, loss_of_tf
 from rsgen.formats.export.shared import ExportOptions, Storage
 from rsgen.geometry import se3
@@ -293,7 +293,7 @@ def test_without_rosbags_and_before_time_0(sequence: Sequence, tmp_path: Path, m
     def absent(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(bag.importlib, "import_module", absent)
+    monkeypatch.setattr(importlib, "import_module", absent)
     with pytest.raises(UserError, match="pip install 'rosbags"):
         export_ros(sequence, tmp_path / "a.bag", ExportOptions("ros1"))
     assert not list(tmp_path.iterdir())

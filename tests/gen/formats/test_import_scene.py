@@ -18,8 +18,7 @@ from rsgen import formats, srgb
 from rsgen.cli.main import main
 from rsgen.errors import UserError
 from rsgen.formats.meshes.mesh_file import part_shapes
-from rsgen.formats.meshes.parts import Part
-from rsgen.formats.polygons import triangulate
+from rsgen.formats.meshes.parts import Part, triangulate
 from rsgen.formats.scenes import content
 from rsgen.formats.scenes.import_scene import write_folder, write_scene
 from rsgen.scene.loading import content_hash, load_scene
