@@ -17,11 +17,11 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from rsgen.array_types import FloatArray
 from rsgen.config.cameras import ColorConfig, DepthConfig, StreamConfig
 from rsgen.config.faults import FaultsConfig, as_declared, from_recorded, moved_to, to_recorded
-from rsgen.config.imu import ImuConfig
 from rsgen.config.motion import MOST_OBJECTS, MotionConfig, ObjectConfig, TremorConfig, content_of
 from rsgen.config.presets import Preset, with_presets
 from rsgen.config.rig import RigColorConfig, RigStream, T_cam_body, check_stereo, with_left_cameras
 from rsgen.config.sections import (
+    ImuConfig,
     LightConfig,
     MocapConfig,
     SceneConfig,

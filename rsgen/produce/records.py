@@ -16,8 +16,8 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.config.cameras import ColorConfig, DepthConfig, StreamConfig
 from rsgen.config.config import Config
 from rsgen.config.faults import ImuFaults, moved_to
-from rsgen.config.imu import ImuConfig
 from rsgen.config.rig import RigColorConfig, RigDepthConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml
 from rsgen.geometry.camera import Camera

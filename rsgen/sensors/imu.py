@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.config.faults import ImuFaults
-from rsgen.config.imu import ImuConfig, Vector3
+from rsgen.config.sections import ImuConfig, Vector3
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry import se3

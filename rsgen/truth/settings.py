@@ -8,8 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from rsgen.config.faults import ImuFaults, split_imu
-from rsgen.config.imu import ImuConfig
-from rsgen.config.sections import MocapConfig, TargetConfig
+from rsgen.config.sections import ImuConfig, MocapConfig, TargetConfig
 from rsgen.errors import UserError, first_problem
 from rsgen.sensors.imu import ImuSamples, simulate_imu
 from rsgen.sequence.images import Rig

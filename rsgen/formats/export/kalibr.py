@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rsgen.array_types import FloatArray
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml

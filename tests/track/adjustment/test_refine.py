@@ -13,7 +13,7 @@ import pytest
 import yaml
 from loop_room import FRAMES, OPTIONS, make_dataset, to_and_fro
 
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline

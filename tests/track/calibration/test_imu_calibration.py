@@ -11,7 +11,7 @@ from tum_recording import make_tum
 from util import random_spline, swung
 
 from rsgen.config.faults import ImuFaults
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline

@@ -15,7 +15,7 @@ from import_command import CONTENT, check_cameras, check_frames, fake_lzfse, imp
 from recordings import COLOR_K, COLOR_SIZE, COUNT
 
 from rsgen.cli.main import main as rsgen
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.geometry import se3
 from rsgen.image_codecs import encode_png
 from rstrack import formats

@@ -8,7 +8,7 @@ from scipy.interpolate import make_lsq_spline
 
 from rsgen.array_types import FloatArray
 from rsgen.config.faults import ImuFaults
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
