@@ -24,8 +24,6 @@ from rsgen.console.scheduler import DaskWorkers, InProcess, open_workers
 from rsgen.errors import UserError
 from rsgen.produce.distribute import RenderJob, render_block
 from rsgen.produce.generate import render_sequence
-from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
-from rsgen.produce.writer import SequenceWriter
 from rsgen.sequence.reader import read_sequence
 
 FRAMES = 15  # 30 images, 4 blocks
@@ -174,11 +172,7 @@ def allow_failures(count: int, dask_scheduler: Any) -> int:
 
 @pytest.fixture(scope="module")
 def job(config: Config, tmp_path_factory: pytest.TempPathFactory) -> RenderJob:
-    motion = load_motion(config)
-    identity = engine_versions(config.backend), input_hashes(config)
-    out = tmp_path_factory.mktemp("sequence")
-    writer = SequenceWriter.open(out, config, motion.spline, sequence_stamps(config, motion), *identity)
-    return RenderJob(writer, *identity, ((0, "color"),), "another scene")
+    return tiny.render_job(config, tmp_path_factory.mktemp("sequence"), (0, "color"))
 
 
 def test_a_worker_that_would_render_something_else_says_so(job: RenderJob, tmp_path: Path) -> None:

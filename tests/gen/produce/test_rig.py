@@ -20,8 +20,7 @@ from rsgen.config.rig import DotsConfig, StereoConfig
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
-from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
+from rsgen.produce.distribute import render_block
 from rsgen.sensors.stereo import dot_pattern, stereo_depth
 from rsgen.sequence.images import Rig, Sequence
 from rsgen.sequence.reader import read_rig, read_sequence
@@ -155,13 +154,8 @@ def test_the_tracker_opens_two_cameras_by_name(root: Path) -> None:
             open_dataset(Path(f"{root}{words}"))
 
 
-def test_a_worker_renders_the_same_bytes(config: Path, root: Path) -> None:
-    loaded = load_config(config)
-    motion = load_motion(loaded)
-    recipe = SequenceRecipe(
-        loaded, motion.spline, sequence_stamps(loaded, motion), engine_versions(loaded.backend), input_hashes(loaded)
-    )
-    files = render_block(RenderJob(recipe, ((1, "matched"), (2, "left"))), no_progress)
+def test_a_worker_renders_the_same_bytes(config: Path, root: Path, tmp_path: Path) -> None:
+    files = render_block(tiny.render_job(load_config(config), tmp_path, (1, "matched"), (2, "left")), no_progress)
     assert {"matched/000001.png", "left/000002.png"} <= set(files)
     assert all((root / name).read_bytes() == data for name, data in files.items())
 
