@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,11 @@ def atomic_write(path: Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise write_error(path, error) from None
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """A text file of these lines, as `atomic_write` writes it. Raises UserError."""
+    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())
 
 
 @contextmanager

@@ -80,7 +80,7 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> Verificati
     path = Path(path)
     try:
         stated = read_rig(path)
-        sequence = stated.as_taken if isinstance(stated, Sequence) else stated
+        sequence = stated.as_taken
     except UserError as error:
         return Verification(path, (Check("read", False, str(error)),))
     depths = [name for name, stream in sequence.streams.items() if stream.is_depth]

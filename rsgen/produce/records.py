@@ -19,7 +19,7 @@ from rsgen.config.faults import ImuFaults, moved_to
 from rsgen.config.rig import RigColorConfig, RigDepthConfig
 from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml
+from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml, write_lines
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import (
@@ -306,8 +306,3 @@ def write_imu(
         T = np.eye(4) if T_image_depth is None else T_image_depth
         atomic_write(out / IMU_TRUTH_CSV, imu_truth_csv(samples).encode())
         atomic_write(out / IMU_TRUTH_YAML, encode_yaml(imu_truth_yaml(imu, faults, start, middle, T)))
-
-
-def write_lines(path: Path, lines: list[str]) -> None:
-    """A text file of these lines. Raises UserError if the disk refuses it."""
-    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())

@@ -15,7 +15,7 @@ from rsgen.array_types import ByteArray, Float32Array, FloatArray, UInt16Array
 from rsgen.config.cameras import DepthConfig
 from rsgen.config.config import Config
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error
+from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error, write_lines
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png, read_png
 from rsgen.produce.records import (
@@ -25,7 +25,6 @@ from rsgen.produce.records import (
     true_cameras,
     write_ground_truth,
     write_imu,
-    write_lines,
     write_listings,
 )
 from rsgen.sensors.color import Setting

@@ -167,6 +167,11 @@ class Rig:
         line = np.rint(np.asarray(uv)[..., self.streams[stream].shutter.axis]).astype(np.int64)
         return poses_of_rows(self.rows(stream)[k])[line]
 
+    @cached_property
+    def as_taken(self) -> Rig:
+        """The same with the cameras that took it: only those of a `Sequence` may be declared otherwise."""
+        return self
+
     def seen_from(self, camera: str) -> Rig:
         """The same with a camera as the body: spline and poses are of it. Itself, if it is the body."""
         T_body_cam = se3.inverse(self.streams[camera].T_cam_body)

@@ -24,7 +24,7 @@ from rsgen.array_types import FloatArray
 from rsgen.config.sections import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml
+from rsgen.files import atomic_write, encode_yaml, write_lines
 from rsgen.formats.export.shared import (
     DEFAULTS,
     EPOCH_S,
@@ -32,8 +32,8 @@ from rsgen.formats.export.shared import (
     counted,
     four_coefficients,
     image_streams,
-    make_folders,
     new_folder,
+    part_of,
     place_images,
 )
 from rsgen.geometry import se3
@@ -80,8 +80,7 @@ def export_euroc(
     if min(*(ns[0] for ns in stamps.values()), nanoseconds(times[:1], epoch_s)[0]) < 0:
         raise UserError(f"{out}: EuRoC's stamps cannot be negative: give an epoch of a second or more")
 
-    new_folder(root)
-    make_folders(*(root / name / "data" for name in sensors), root / _TRUTH)
+    new_folder(root, *(f"{name}/data" for name in sensors), _TRUTH, *(["imu0"] if imu else []))
     atomic_write(root / "body.yaml", encode_yaml(_body_yaml(sequence, imu.config if imu else None, epoch_s)))
     truth = truth_csv(sequence, times, T_depth_body, imu.samples if imu else None, epoch_s)
     atomic_write(root / _TRUTH / "data.csv", truth)
@@ -92,17 +91,13 @@ def export_euroc(
     }
     atomic_write(root / _TRUTH / "sensor.yaml", encode_yaml(truth_sensor))
     if imu:
-        make_folders(root / "imu0")
         write_imu_csv(root / "imu0" / "data.csv", imu.samples, epoch_s)
         atomic_write(root / "imu0" / "sensor.yaml", encode_yaml(_imu_yaml(imu.config)))
     for k, (name, (stream, _)) in enumerate(sensors.items()):
-        files = [f"{ns}.png" for ns in stamps[name]]
-        rows = [f"{ns},{file}" for ns, file in zip(stamps[name], files, strict=True)]
-        atomic_write(root / name / "data.csv", "\n".join(["#timestamp [ns],filename", *rows, ""]).encode())
+        write_lines(root / name / "data.csv", ["#timestamp [ns],filename", *(f"{ns},{ns}.png" for ns in stamps[name])])
         atomic_write(root / name / "sensor.yaml", encode_yaml(described[name]))
-        targets = [root / name / "data" / file for file in files]
-        part = k / len(sensors), (k + 1) / len(sensors)
-        place_images(stream.paths, targets, options.copy, progress, part)
+        part = part_of(progress, k / len(sensors), (k + 1) / len(sensors))
+        place_images(stream.paths, root / name / "data", options.copy, part, [f"{ns}.png" for ns in stamps[name]])
     return f"{root}: {counted(streams)}, {f'{len(times)} IMU samples' if imu else 'no IMU'}, stamps + {epoch_s} s"
 
 

@@ -19,7 +19,6 @@ from rsgen.formats.export.shared import (
     EPOCH_S,
     ExportOptions,
     four_coefficients,
-    make_folders,
     new_folder,
     place_images,
 )
@@ -60,10 +59,10 @@ def export_kalibr(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, p
         written.append("target.yaml")
         for name, stream in zip(chain, sequence.streams.values(), strict=True):
             if not stream.is_depth:
-                make_folders(out / name)
-                targets = [out / name / f"{ns}.png" for ns in nanoseconds(stream.listed, EPOCH_S)]
-                place_images(stream.paths, targets, options.copy, progress)
-                written.append(f"{name}/ with {len(targets)} images")
+                new_folder(out / name)
+                files = [f"{ns}.png" for ns in nanoseconds(stream.listed, EPOCH_S)]
+                place_images(stream.paths, out / name, options.copy, progress, files)
+                written.append(f"{name}/ with {len(files)} images")
         if imu:
             write_imu_csv(out / "imu0.csv", imu.samples, EPOCH_S)
             written.append("imu0.csv")

@@ -19,7 +19,7 @@ from rsgen.files import read_bytes
 from rsgen.formats.export.shared import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
 from rsgen.sequence.format import ground_truth
-from rsgen.sequence.images import ImageStream, Rig, Sequence
+from rsgen.sequence.images import ImageStream, Rig
 from rsgen.truth.settings import sequence_imu
 
 TIMELINE = "time"
@@ -35,7 +35,7 @@ def export_rerun(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, pr
     """
     out = Path(out)
     with recording_file(out, "rsgen", sequence.name, "--out") as (rr, recording):
-        _log(rr, recording, sequence.as_taken if isinstance(sequence, Sequence) else sequence, progress)
+        _log(rr, recording, sequence.as_taken, progress)
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB, open it with 'rerun {out.name}'"
 
 

@@ -52,7 +52,7 @@ def test_images_are_copied_where_links_cannot_be(
 
     monkeypatch.setattr(shared.os, "link", no_link)
     source = plain.streams["color"].paths[0]
-    place_images([source], [tmp_path / "a.png"], False, no_progress)
+    place_images([source], tmp_path, False, no_progress, ["a.png"])
     assert (tmp_path / "a.png").read_bytes() == source.read_bytes()
 
 
