@@ -141,7 +141,7 @@ def _source(block: RenderJob, progress: Progress) -> FrameSource:
         raise UserError(f"{config.scene.file}: is missing: workers need the scene at the same path (a shared disk)")
     if scene_hash(config) != block.inputs["scene"]:
         raise UserError(f"{config.scene.file}: or a file of it is another one here: copy the scene again")
-    for name, found in mesh_hashes(config.objects, config.backend).items():
+    for name, found in mesh_hashes(config).items():
         if found != block.inputs[name]:
             raise UserError(f"{name}: its mesh is another one here: copy it again")
     return open_frames(config, progress, objects=block.writer.objects)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from rsgen.produce.parts import (
     TrueMotion,
     engine_versions,
     input_hashes,
-    load_meshes,
     load_motion,
     load_scene,
     open_frames,
@@ -31,6 +31,8 @@ from rsgen.produce.parts import (
     sequence_stamps,
 )
 from rsgen.produce.writer import SequenceWriter
+from rsgen.scene.meshes import ply_bytes, surface
+from rsgen.scene.object_meshes import load_object
 from rsgen.sensors.color import Reading, Setting, adapt
 from rsgen.sequence.truth_files import LABELS, labels_yaml, mesh_file, thing_of
 
@@ -55,32 +57,35 @@ def render_sequence(
     if frames.start is not None and frames.start >= (longest := max(map(len, stamps.values()))):
         raise UserError(f"--frames: the sequence has no frame {frames.start}, only 0 to {longest - 1}")
     identity = engine_versions(config.backend), input_hashes(config)
-    meshes, scene = load_meshes(config.objects), loaded.scene if loaded else None
+    meshes = [load_object(thing) for thing in config.objects]
+
+    @cache
+    def scene() -> Any:
+        return loaded.scene if loaded else load_scene(config)
+
+    @cache
+    def source() -> FrameSource:
+        return open_frames(config, progress, scene=scene(), objects=writer.objects, loaded=loaded)
+
     # In a new folder: a scene that does not load must not leave one behind that its repaired self cannot continue.
     if not (out / "sequence.yaml").exists():
-        scene = scene or load_scene(config)
-        _check_ways(config, motion, meshes, scene)
+        _check_ways(config, motion, meshes, scene())
     writer = SequenceWriter.open(out, config, motion.spline, stamps, *identity, motion.objects)
     write_origin(out, config)
-    source = None
     for name in (name for name, camera in config.cameras.items() if camera.adapts):
-        source = source or open_frames(config, progress, scene=scene, objects=writer.objects, loaded=loaded)
-        writer = writer.adapted(name, automatic_settings(name, source, writer, progress))
+        writer = writer.adapted(name, automatic_settings(name, source(), writer, progress))
     todo = sorted((k, s) for s in config.cameras for k in _chosen(writer.missing(s), frames, len(stamps[s])))
     if not (out / "scene.ply").is_file():
-        scene = scene or load_scene(config)
-        write_scene_ply(scene, out / "scene.ply")
+        atomic_write(out / "scene.ply", ply_bytes(*surface(scene())))
     if config.truth.labels and not (out / LABELS).is_file():
-        scene = scene or load_scene(config)
-        atomic_write(out / LABELS, encode_yaml(label_table(scene, config, meshes)))
+        atomic_write(out / LABELS, encode_yaml(label_table(scene(), config, meshes)))
     for thing, mesh in zip(config.objects, meshes, strict=True):
-        write_ply(mesh.vertices, mesh.faces, out / mesh_file(thing.name))
+        atomic_write(out / mesh_file(thing.name), ply_bytes(mesh.vertices, mesh.faces))
     try:
         if todo and workers is not None:
             render_blocks(writer, todo, *identity, workers, progress)
         elif todo:
-            source = source or open_frames(config, progress, scene=scene, objects=writer.objects, loaded=loaded)
-            render_shots(writer, source, todo, progress)
+            render_shots(writer, source(), todo, progress)
     except (KeyboardInterrupt, SystemExit):
         # A run that the user ends here leaves a readable, shorter sequence.
         writer.finish()
@@ -132,25 +137,8 @@ def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
 
 def scene_triangles(scene: Any) -> FloatArray:
     """Corners (m, 3, 3) of all triangles of a Mitsuba scene, world frame, metres."""
-    from rsgen.scene.meshes import surface
-
     vertices, faces = surface(scene)
     return np.asarray(vertices, float)[faces]
-
-
-def write_scene_ply(scene: Any, path: Path) -> None:
-    """All triangles of the scene, world frame, metres, as binary PLY. Raises UserError if it cannot be written."""
-    from rsgen.scene.meshes import surface
-
-    vertices, faces = surface(scene)
-    write_ply(vertices, faces, path)
-
-
-def write_ply(vertices: Any, faces: Any, path: Path) -> None:
-    """Triangles as binary PLY. Raises UserError if it cannot be written."""
-    from rsgen.scene.meshes import ply_bytes
-
-    atomic_write(path, ply_bytes(vertices, faces))
 
 
 def write_origin(out: Path, config: Config) -> None:
