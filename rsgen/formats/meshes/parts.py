@@ -24,6 +24,10 @@ from rsgen.scene.meshes import has_area
 
 log = logging.getLogger("rsgen")
 
+WHITE = Material(color=np.ones(3))
+"""Of parts that have colours of their own."""
+
+_TEXTURES = ("color_texture", "metal_texture", "normal_texture", "emission_texture")
 _STRAIGHT = 1e-9  # of a polygon's area: corners that turn less go straight on
 _USUAL_M = (0.02, 300.0)  # sizes outside are rather wrong units
 _FINE_TEXELS = 2.0  # triangles this small are cut along a straight line
@@ -44,6 +48,17 @@ class Part:
     uv: FloatArray | None = None
     vertex_colors: FloatArray | None = None
     face_colors: FloatArray | None = None
+
+
+def v_down(uv: FloatArray) -> FloatArray:
+    """Texture coordinates (..., 2) whose v runs down, as Mitsuba's does, of those whose v runs up; finite."""
+    return np.clip(np.nan_to_num(uv * [1, -1] + [0, 1]), -1e5, 1e5)
+
+
+def without_textures(material: Material) -> Material:
+    """The material of a part without coordinates; itself where it has no textures."""
+    given = {name: None for name in _TEXTURES if getattr(material, name) is not None}
+    return replace(material, **given) if given else material  # type: ignore[arg-type]
 
 
 def joined(parts: Sequence[Part]) -> Part:
