@@ -81,7 +81,9 @@ def export_euroc(
         raise UserError(f"{out}: EuRoC's stamps cannot be negative: give an epoch of a second or more")
 
     new_folder(root, *(f"{name}/data" for name in sensors), _TRUTH, *(["imu0"] if imu else []))
-    atomic_write(root / "body.yaml", encode_yaml(_body_yaml(sequence, imu.config if imu else None, epoch_s)))
+    frame = "the IMU" if imu else "the depth camera" if isinstance(sequence, Sequence) else "that of the rig"
+    body: dict[str, Any] = {"comment": f"rsgen {sequence.name}: the body is {frame}", "epoch_s": epoch_s}
+    atomic_write(root / "body.yaml", encode_yaml(body | ({"gravity": list(imu.config.gravity)} if imu else {})))
     truth = truth_csv(sequence, times, T_depth_body, imu.samples if imu else None, epoch_s)
     atomic_write(root / _TRUTH / "data.csv", truth)
     truth_sensor = {
@@ -165,12 +167,6 @@ def _imu_yaml(imu: ImuConfig) -> dict[str, Any]:
         "accelerometer_noise_density": imu.accelerometer_noise_density,
         "accelerometer_random_walk": imu.accelerometer_random_walk,
     }
-
-
-def _body_yaml(sequence: Rig, imu: ImuConfig | None, epoch_s: int) -> dict[str, Any]:
-    frame = "the IMU" if imu else "the depth camera" if isinstance(sequence, Sequence) else "that of the rig"
-    data: dict[str, Any] = {"comment": f"rsgen {sequence.name}: the body is {frame}", "epoch_s": epoch_s}
-    return data | ({"gravity": list(imu.gravity)} if imu else {})
 
 
 def _matrix(T: FloatArray) -> dict[str, Any]:
