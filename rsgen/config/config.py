@@ -241,14 +241,13 @@ def recorded_config(data: dict[str, Any], where: str) -> Config:
 def validate_config(data: dict[str, Any], where: str) -> Config:
     """A config from plain YAML types; `where` begins the message. Raises UserError naming every wrong field."""
     try:
-        return Config.model_validate(_completed(with_presets(data)))
+        data = with_presets(data)
+        if "streams" in data:
+            data = data | {"streams": with_left_cameras(data["streams"])}
+        return Config.model_validate(data)
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
         raise _error(f"{where}: {problems}") from None
-
-
-def _completed(data: dict[str, Any]) -> dict[str, Any]:
-    return data | {"streams": with_left_cameras(data["streams"])} if "streams" in data else data
 
 
 def _error(text: str) -> UserError:

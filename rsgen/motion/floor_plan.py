@@ -88,9 +88,7 @@ def find_floors(cast: Cast, low: FloatArray, high: FloatArray) -> list[Floor]:
     Columns of rays go down through everything; what has HEADROOM_M of air above it may be a floor.
     """
     size = high - low
-    x, z = (low[k] + (np.arange(_COLUMNS) + 0.5) / _COLUMNS * size[k] for k in (0, 2))
-    p = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
-    p = np.stack([p[:, 0], np.full(len(p), high[1] + 1.0), p[:, 1]], axis=1)
+    p = _columns(low, high, high[1] + 1.0)
     skin, above = 1e-4 * max(1.0, float(size.max())), np.full(len(p), np.inf)
     heights, gaps = [], []
     for _ in range(_MOST_STOREYS):
@@ -140,10 +138,14 @@ def floor_plan(triangles: FloatArray, cast: Cast, floor: Floor, clearance_m: flo
 
 def share_without_floor(cast: Cast, low: FloatArray, high: FloatArray) -> float:
     """Share in [0, 1] of the places halfway up the box of corners low and high (3,), m, with walls but no floor."""
-    x, z = (low[k] + (np.arange(_COLUMNS) + 0.5) / _COLUMNS * (high[k] - low[k]) for k in (0, 2))
-    p = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
-    walled, _, ground = _around(np.insert(p, 1, 0.5 * (low[1] + high[1]), axis=1), cast, math.inf)
+    walled, _, ground = _around(_columns(low, high, 0.5 * (low[1] + high[1])), cast, math.inf)
     return float((walled & np.isneginf(ground)).mean())
+
+
+def _columns(low: FloatArray, high: FloatArray, y: float) -> FloatArray:
+    """Points (_COLUMNS², 3) at the height y, evenly over x and z of the box of corners low and high (3,)."""
+    x, z = (low[k] + (np.arange(_COLUMNS) + 0.5) / _COLUMNS * (high[k] - low[k]) for k in (0, 2))
+    return np.insert(np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2), 1, y, axis=1)
 
 
 def _around(p_world: FloatArray, cast: Cast, far: float) -> tuple[BoolArray, FloatArray, FloatArray]:

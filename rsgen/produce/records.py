@@ -32,7 +32,6 @@ from rsgen.sensors.imu import (
     write_imu_csv,
 )
 from rsgen.sensors.reports import deliver, reported_poses
-from rsgen.sequence.camera_yaml import Cameras
 from rsgen.sequence.format import (
     CLEAN_COLOR,
     FILES,
@@ -127,13 +126,6 @@ def _rows(T: Sequence[Sequence[float]]) -> list[list[float]]:
 
 def _truth_yaml(config: Config, camera: str) -> dict[str, list[str]]:
     return {name: list(channels) for name, channels in image_truth(config, camera).items()}
-
-
-def true_cameras(config: Config) -> Cameras:
-    """The cameras that take the images, whatever `faults.declared` states."""
-    color, depth = config.color, config.depth
-    T_color_depth = np.array(config.T_color_depth, float)
-    return Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)
 
 
 def image_truth(config: Config, camera: str) -> dict[str, tuple[str, ...]]:

@@ -22,7 +22,6 @@ from rsgen.produce.records import (
     ListedStream,
     describe,
     refuse_foreign_folder,
-    true_cameras,
     write_ground_truth,
     write_imu,
     write_listings,
@@ -30,7 +29,7 @@ from rsgen.produce.records import (
 from rsgen.sensors.color import Setting
 from rsgen.sensors.imu import sample_clock
 from rsgen.sensors.reports import color_clock
-from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
+from rsgen.sequence.camera_yaml import TRUE_CAMERAS, Cameras, camera_yaml
 from rsgen.sequence.format import (
     LABELS_IMAGE,
     OBJECT_CHANNELS,
@@ -234,8 +233,8 @@ class SequenceWriter:
         if faults.declared is not None:
             firsts = float(stamps["color"][0]), float(stamps["depth"][0])
             clock = color_clock(faults.color, faults.depth, *firsts, middle)
-            cameras = camera_yaml(true_cameras(config), clock, config.depth.registered)
-            atomic_write(out / TRUE_CAMERAS, encode_yaml(cameras))
+            cameras = Cameras.of(config.color, config.depth, config.T_color_depth)
+            atomic_write(out / TRUE_CAMERAS, encode_yaml(camera_yaml(cameras, clock, config.depth.registered)))
         if (target := config.target) is not None:
             text = target_corners_text(target.grid, np.array(target.T_world_target, float))
             atomic_write(out / TARGET_CORNERS, text.encode())

@@ -14,8 +14,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rsgen.config.cameras import ColorConfig
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress, no_progress
@@ -151,10 +149,8 @@ def _loaded_scene(job: SuiteJob, progress: Progress) -> LoadedScene | None:
 
 def _stated_cameras(config: Config) -> dict[str, Any]:
     """A camera.yaml of what sequence.yaml states: of a driver's stamps colour's offset is not known."""
-    color, depth, faults = config.declared_color, config.declared_depth, config.injected
-    T_color_depth = np.array(config.declared_T_color_depth, float)
-    is_exact = faults.color is None and faults.depth is None
-    cameras = Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)
+    cameras = Cameras.of(config.declared_color, config.declared_depth, config.declared_T_color_depth)
+    is_exact = config.injected.color is None and config.injected.depth is None
     clock = ColorClock() if is_exact else ColorClock("auto", is_exact=False)
     return camera_yaml(cameras, clock, config.depth.registered)
 

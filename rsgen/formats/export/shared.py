@@ -192,10 +192,9 @@ def aligned_depth(sequence: Sequence, folder: Path, copy: bool, progress: Progre
 def registered_cameras(sequence: Sequence) -> dict[str, Any]:
     """A camera.yaml of depth that was warped into the colour camera: from where, and whose rows' times it has."""
     color, depth = sequence.streams["color"], sequence.streams["depth"]
-    sensors = color.camera, color.shutter, depth.camera, depth.shutter
     driver = any((stream.listed != stream.stamps).any() for stream in (color, depth))
     clock = ColorClock("auto", is_exact=False) if driver else ColorClock()
-    return camera_yaml(Cameras(*sensors, depth.depth_scale, sequence.T_color_depth), clock, is_registered=True)
+    return camera_yaml(Cameras.of(color, depth, sequence.T_color_depth), clock, is_registered=True)
 
 
 def color_truth(sequence: Sequence) -> tuple[FloatArray, str]:

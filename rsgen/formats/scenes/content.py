@@ -83,7 +83,11 @@ def lamp_shapes(lamps: Sequence[Lamp], folder: Path) -> tuple[dict[str, Any], li
     others = [lamp for lamp in lamps if lamp.kind != "sky"]
     shapes = {f"light{number:05}": _entry(lamp) for number, lamp in enumerate(others)}
     if pictured:
-        shapes["sky"] = _environment(pictured[0], folder)
+        sky, file = pictured[0], folder / f"sky{pictured[0].suffix}"
+        file.write_bytes(sky.picture or b"")
+        # Its one factor is the value's mean, so that the colour of a sky with a picture is lost.
+        factor = float(sky.value.mean())
+        shapes["sky"] = {"type": "envmap", "filename": str(file), "scale": factor, "to_world": sky.T_world_lamp}
     elif skies:
         total = np.sum([lamp.value for lamp in skies], axis=0)
         shapes["sky"] = {"type": "constant", "radiance": _rgb(total)}
@@ -107,14 +111,6 @@ def _entry(lamp: Lamp) -> dict[str, Any]:
     cutoff, beam = lamp.cone_deg
     cone = {"cutoff_angle": cutoff, "beam_width": min(beam, 0.999 * cutoff)}
     return {"type": "spot", "to_world": T @ _TURN, "intensity": _rgb(lamp.value), **cone}
-
-
-def _environment(lamp: Lamp, folder: Path) -> dict[str, Any]:
-    """An envmap; its one factor is the value's mean, so that the colour of a sky with a picture is lost."""
-    assert lamp.picture is not None
-    file = folder / f"sky{lamp.suffix}"
-    file.write_bytes(lamp.picture)
-    return {"type": "envmap", "filename": str(file), "scale": float(lamp.value.mean()), "to_world": lamp.T_world_lamp}
 
 
 def _rgb(value: Any) -> dict[str, Any]:
