@@ -11,7 +11,7 @@ import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.formats.meshes.parts import WHITE, Part, triangulate, v_down, without_textures
-from rsgen.formats.scenes.content import Notes
+from rsgen.formats.scenes.import_scene import Notes
 from rsgen.formats.scenes.usd_material import BoundMaterial
 
 SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane")
