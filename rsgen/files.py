@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,6 +57,27 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise write_error(path, error) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """An empty folder beside `path`, whose own folder is made too, for what is to be there.
+
+    Once the block ends well it is at `path`, in place of what was; else it is deleted. Raises UserError for an OSError.
+    """
+    temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{word}.tmp") for word in ("new", "old"))
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        yield temporary
+        if path.exists():
+            path.rename(old)
+        os.replace(temporary, path)  # noqa: PTH105 - one name for tests to break
+    except OSError as error:
+        raise write_error(path, error) from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def write_error(path: Path, error: OSError) -> UserError:

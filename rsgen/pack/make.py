@@ -12,8 +12,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import os
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +26,7 @@ from rsgen.config.sections import GlobalTime, TruthConfig
 from rsgen.console.progress import Progress
 from rsgen.console.scheduler import Workers
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml, read_yaml, write_error
+from rsgen.files import atomic_write, encode_yaml, read_yaml, whole_folder, write_error
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png
@@ -117,22 +115,14 @@ def make_sequence(job: PackJob, progress: Progress) -> None:
     """Render one sequence into its folder, which is there when all of it is. Raises UserError."""
     loaded = loaded_last(job.key, lambda: load_scene_and_light(job.config, progress))
     layout = job.options.layout
-    temporary = job.folder.with_name(f".{job.folder.name}.{os.getpid()}.tmp")
-    try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
+    with whole_folder(job.folder) as folder:
         for k, pair in enumerate(_pairs(job, loaded)):
             for name, data in pair_files(layout, k, pair).items():
-                (temporary / name).write_bytes(data)
+                (folder / name).write_bytes(data)
         name, text = mark_file(layout, job.drawn, _mean_twist(job), job.config.color.rate_hz)
-        (temporary / GYRO).write_bytes(imu_csv(_gyro_samples(job)).encode())
-        (temporary / DRAWN).write_text(json.dumps(_about(job), indent=1) + "\n")
-        (temporary / name).write_bytes(text)
-        os.replace(temporary, job.folder)  # noqa: PTH105 - one name for tests to break
-    except OSError as error:
-        raise write_error(job.folder, error) from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        (folder / GYRO).write_bytes(imu_csv(_gyro_samples(job)).encode())
+        (folder / DRAWN).write_text(json.dumps(_about(job), indent=1) + "\n")
+        (folder / name).write_bytes(text)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -19,7 +17,7 @@ from rsgen.array_types import FloatArray
 from rsgen.config.sections import Up
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError, first_few, how_to_install
-from rsgen.files import write_error
+from rsgen.files import whole_folder
 from rsgen.formats import IMPORTS, scene_importer
 from rsgen.formats.meshes.default_light import light_shapes
 from rsgen.formats.meshes.mesh_file import part_shapes, read_parts
@@ -212,21 +210,8 @@ def write_folder(out: Path, force: bool, fill: Callable[[Path], Made]) -> Made:
         raise UserError(f"{out}: is there already: choose another folder, or replace it with --force")
     if out.exists() and not (out / NAME).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out}: is no folder of 'rsgen import' ({NAME} is not in it): delete it yourself")
-    new, old = (out.with_name(f".{out.name}.{os.getpid()}.{word}") for word in ("new", "old"))
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        new.mkdir()
-        try:
-            made = fill(new)
-            if out.exists():
-                out.rename(old)
-            new.rename(out)
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
-            shutil.rmtree(old, ignore_errors=True)
-    except OSError as error:
-        raise write_error(out, error) from None
-    return made
+    with whole_folder(out) as folder:
+        return fill(folder)
 
 
 def write_scene(scene: dict[str, Any], comments: Sequence[str], folder: Path) -> None:
