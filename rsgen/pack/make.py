@@ -119,7 +119,8 @@ def make_sequence(job: PackJob, progress: Progress) -> None:
         for k, pair in enumerate(_pairs(job, loaded)):
             for name, data in pair_files(layout, k, pair).items():
                 (folder / name).write_bytes(data)
-        name, text = mark_file(layout, job.drawn, _mean_twist(job), job.config.color.rate_hz)
+        twist = job.spline.velocity(np.linspace(0.0, _end_s(job), 64)).mean(axis=0)
+        name, text = mark_file(layout, job.drawn, twist, job.config.color.rate_hz)
         (folder / GYRO).write_bytes(imu_csv(_gyro_samples(job)).encode())
         (folder / DRAWN).write_text(json.dumps(_about(job), indent=1) + "\n")
         (folder / name).write_bytes(text)
@@ -230,11 +231,6 @@ def _gyro_samples(job: PackJob) -> ImuSamples:
     gravity = _GRAVITY if job.config.imu is None else job.config.imu.gravity
     gyro, accel = exact_imu(job.spline, np.eye(4), gravity, t)
     return ImuSamples(t, gyro, accel, np.zeros_like(gyro), np.zeros_like(accel), stamps=t)
-
-
-def _mean_twist(job: PackJob) -> FloatArray:
-    """v, ω (6,) of the colour camera in its own frame, m/s and rad/s, averaged over the sequence's frames."""
-    return np.asarray(job.spline.velocity(np.linspace(0.0, _end_s(job), 64)).mean(axis=0))
 
 
 def _end_s(job: PackJob) -> float:

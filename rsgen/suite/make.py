@@ -56,7 +56,9 @@ class SuiteJob:
     @property
     def key(self) -> str:
         """Of the scene and its light."""
-        return json.dumps([part.model_dump(mode="json") for part in _lit(self.planned.config)])
+        config = self.planned.config
+        lit = config.scene, config.light, config.target
+        return json.dumps([part.model_dump(mode="json") for part in lit if part])
 
 
 @dataclass(frozen=True)
@@ -131,10 +133,6 @@ def make_sequence(job: SuiteJob, progress: Progress) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-
-
-def _lit(config: Config) -> list[Any]:
-    return [config.scene, config.light, *([config.target] if config.target else [])]
 
 
 def _loaded_scene(job: SuiteJob, progress: Progress) -> LoadedScene | None:
