@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -74,7 +74,8 @@ def render_sequence(
     write_origin(out, config)
     for name in (name for name, camera in config.cameras.items() if camera.adapts):
         writer = writer.adapted(name, automatic_settings(name, source(), writer, progress))
-    todo = sorted((k, s) for s in config.cameras for k in _chosen(writer.missing(s), frames, len(stamps[s])))
+    wanted = {s: range(*frames.indices(len(of_stream))) for s, of_stream in stamps.items()}
+    todo = sorted((k, s) for s in config.cameras for k in writer.missing(s) if k in wanted[s])
     if not (out / "scene.ply").is_file():
         atomic_write(out / "scene.ply", ply_bytes(*surface(scene())))
     if config.truth.labels and not (out / LABELS).is_file():
@@ -128,11 +129,6 @@ def label_table(scene: Any, config: Config, meshes: Sequence[Any]) -> dict[str, 
     for thing, mesh in zip(config.objects, meshes, strict=True):
         things.append(thing_of(thing.name, mesh.vertices[mesh.faces]))
     return labels_yaml(things, config.truth.classes)
-
-
-def _chosen(missing: Iterable[int], frames: slice, count: int) -> list[int]:
-    wanted = set(range(*frames.indices(count)))
-    return [k for k in missing if k in wanted]
 
 
 def scene_triangles(scene: Any) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Parts of a scene file: triangles of one material, of its polygons, in the world, without what cannot be seen.
+"""Parts of a scene file: triangles of one material in the world, of its polygons, without what cannot be seen.
 
 Mitsuba and trimesh take every polygon for convex, and a wall with a niche loses the niche. Depth, truth and baked light
 know triangles only, so what an alpha mask hides is cut out of the triangles.
