@@ -10,7 +10,7 @@ from skimage.graph import MCP_Geometric
 from skimage.measure import find_contours
 
 from rsgen.array_types import BoolArray, FloatArray
-from rsgen.motion.floor_plan import BOB_M, Cast, FloorPlan
+from rsgen.motion.free_space import BOB_M, Cast, FloorPlan
 
 _SLACK_M = 0.04  # hand-shake, and the curve between waypoints, need so much more than the clearance
 _DISTANCES_M = (1.2, 1.0, 0.8, 0.65, 0.5)

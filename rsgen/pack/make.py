@@ -32,7 +32,7 @@ from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png
 from rsgen.motion.stretch import Drawn, along, draw_stretch
 from rsgen.pack.draw import Layout, PackOptions
-from rsgen.produce.distribute import by_scene, for_other_processes, loaded_last
+from rsgen.produce.generate import by_scene, for_other_processes, loaded_last
 from rsgen.produce.parts import LoadedScene, engine_versions, input_hashes, load_motion, load_scene_and_light
 from rsgen.produce.records import fingerprint
 from rsgen.sensors.color import apply_color_noise

@@ -28,7 +28,7 @@ from rsgen.console.tables import Table
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import parse_yaml
-from rsgen.motion.floor_plan import find_floors
+from rsgen.motion.free_space import find_floors
 from rsgen.scene.loading import content_hash, load_scene
 from rsgen.scene.meshes import surface
 

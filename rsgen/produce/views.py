@@ -16,7 +16,7 @@ import numpy as np
 from rsgen import srgb
 from rsgen.array_types import BoolArray, Float32Array, FloatArray
 from rsgen.geometry.camera import Camera
-from rsgen.motion.floor_plan import Cast
+from rsgen.motion.free_space import Cast
 from rsgen.motion.walk import unit_directions
 from rsgen.produce.camera_sources import small_camera
 

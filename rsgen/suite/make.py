@@ -28,8 +28,7 @@ from rsgen.files import (
     remove_stale_temporaries,
     write_error,
 )
-from rsgen.produce.distribute import by_scene, for_other_processes, loaded_last
-from rsgen.produce.generate import ORIGIN, render_sequence
+from rsgen.produce.generate import ORIGIN, by_scene, for_other_processes, loaded_last, render_sequence
 from rsgen.produce.parts import LoadedScene, load_scene_and_light
 from rsgen.produce.records import fingerprint
 from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml

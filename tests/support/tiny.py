@@ -16,7 +16,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from rsgen.config.config import Config
-from rsgen.produce.distribute import RenderJob
+from rsgen.produce.generate import RenderJob
 from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
 from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Setting

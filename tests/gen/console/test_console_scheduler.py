@@ -22,8 +22,7 @@ from rsgen.config.config import Config, load_config
 from rsgen.console import scheduler
 from rsgen.console.scheduler import DaskWorkers, InProcess, open_workers
 from rsgen.errors import UserError
-from rsgen.produce.distribute import RenderJob, render_block
-from rsgen.produce.generate import render_sequence
+from rsgen.produce.generate import RenderJob, render_block, render_sequence
 from rsgen.sequence.reader import read_sequence
 
 FRAMES = 15  # 30 images, 4 blocks

@@ -20,7 +20,7 @@ from rsgen.config.rig import DotsConfig, StereoConfig
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.produce.distribute import render_block
+from rsgen.produce.generate import render_block
 from rsgen.sensors.stereo import dot_pattern, stereo_depth
 from rsgen.sequence.images import Rig, Sequence
 from rsgen.sequence.reader import read_rig, read_sequence

@@ -16,7 +16,7 @@ from rsgen.config.config import load_config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.produce.camera_sources import setting_of
-from rsgen.produce.distribute import render_block
+from rsgen.produce.generate import render_block
 from rsgen.sensors.color import Reading, Setting, adapt, apply_color_noise, apply_setting, reading
 from rsgen.sequence.reader import read_sequence
 
