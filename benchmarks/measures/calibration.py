@@ -19,7 +19,7 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
-from rstrack.bench.definitions import SequenceEntry, StrictModel
+from rstrack.bench.cells import SequenceEntry, StrictModel
 from rstrack.bench.measures.track import track_cell
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of

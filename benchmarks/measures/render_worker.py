@@ -33,7 +33,7 @@ from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.produce.parts import lines_of_sight, load_motion, load_scene, mirrored_samples, surfaces_hash
-from rstrack.bench.machine import peak_mb, reset_peak
+from rstrack.bench.record import peak_mb, reset_peak
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")
 BLUR_S, READOUT_S = 0.020, 0.028

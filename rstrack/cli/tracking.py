@@ -18,7 +18,7 @@ from rstrack.options import Options
 
 if TYPE_CHECKING:
     from rstrack.data.dataset import Dataset
-    from rstrack.view.viewer import Viewer
+    from rstrack.view import Viewer
 
 TRACK_STATUS = (
     "exit status: 0 done, 1 frames were lost or cannot be read, 2 wrong input, 130 interrupted (what there is has been "
@@ -121,7 +121,7 @@ def track(
 def _viewed(view: Path | None, dataset: Dataset) -> AbstractContextManager[Viewer | None]:
     if view is None:
         return nullcontext()
-    from rstrack.view.viewer import open_view
+    from rstrack.view import open_view
 
     return open_view(None if view == Path() else view, dataset.rig, dataset.name)
 
@@ -170,8 +170,8 @@ def calibrate(
     from rstrack.calibration.several import check_alike, together
     from rstrack.data.dataset import open_dataset
     from rstrack.data.image_files import NoisyImages
-    from rstrack.report.build import write_page
     from rstrack.report.calibration import calibration_page
+    from rstrack.report.page import write_page
 
     known = None if device is None else device_named(device)
     groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())

@@ -40,6 +40,7 @@ from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Rig, rigid_transform, s
 from rstrack.data.timing import StampsMode
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
+CAMERA_FILES = ("camera.yaml", "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml")
 _KEYS = "color, depth, T_color_depth, stamps, clocks and sigma, each camera with width, height, intrinsics, readout_s"
 
 Size = tuple[int, int]
@@ -194,6 +195,13 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
         return _of_content(path, opencv_content(path, text, color_size, depth_size))
     content = read_yaml(path)
     return _of_camchain(read_camchain(path, content)) if is_camchain(content) else _of_content(path, content)
+
+
+def find_camera_file(root: Path, camera_file: Path | None) -> Path | None:
+    """The given one, else that in the folder, None without any."""
+    if camera_file is not None:
+        return camera_file
+    return next((root / name for name in CAMERA_FILES if (root / name).exists()), None)
 
 
 def run_cameras(info: Mapping[str, Any]) -> dict[str, Any] | None:

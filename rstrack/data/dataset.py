@@ -256,6 +256,35 @@ def open_tracked(path: Path, run: Path, info: dict[str, Any], camera_file: Path 
     return open_dataset(path, camera_file or recorded).as_seen_by(info)
 
 
+def recorded_dataset(
+    root: Path, file: RigFile, depth_stamps: FloatArray, color_stamps: FloatArray, images: ImageReader,
+    truth_poses: Trajectory | None, notes: tuple[str, ...], depth_numbers: FloatArray | None = None,
+) -> Dataset:  # fmt: skip
+    """A recording's folder with the stamps as its camera file wants them.
+
+    file: the camera file's content. depth_stamps (n,), color_stamps (m,): as listed, s, increasing. truth_poses:
+    T_world_depth. notes: what had to be assumed, each in one line. depth_numbers: of frames that are numbered, the
+    seconds (n,) by their numbers alone. Raises UserError.
+    """
+    name = root.resolve().name
+    file = file.of(name)
+    try:
+        depth = stream_timing("depth", depth_stamps, file.stamps, file.depth_offset_s)
+        color = stream_timing("colour", color_stamps, file.stamps, 0.0)
+    except UserError as error:
+        raise UserError(f"{root}: {error}") from None
+    if depth_numbers is not None:
+        depth = replace(depth, listed=depth_numbers)
+    timing = Timing(depth, color, file.color_offset_s, file.notes)
+    dataset = Dataset(
+        name, root, file.rig, depth.used, color.used, (), images, truth_poses=truth_poses, notes=notes, timing=timing,
+        scan_named=file.scan_named, depth_scale=file.depth_scale, depth_offset_s=file.depth_offset_s,
+        depth_error=file.depth_error,
+    )  # fmt: skip
+    found = dataset.with_color_offset(file.color_offset_s or 0.0, drift=file.color_drift)
+    return replace(found, timing=timing)
+
+
 def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tuple[tuple[int, ...], ...]:
     """For each depth image (n,) the colour images (m,) that are nearer to it than to any other; ties: the earlier.
 

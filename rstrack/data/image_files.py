@@ -85,6 +85,16 @@ def repeated(paths: Sequence[Path]) -> npt.NDArray[np.bool_]:
     return same
 
 
+def repeats_note(name: str, again: npt.NDArray[np.bool_]) -> tuple[str, ...]:
+    """For the screen, nothing where there are none. again (n,): which images of a stream are the one before again."""
+    if not again.any():
+        return ()
+    return (
+        f"{np.count_nonzero(again)} of {len(again)} {name} images are the one before again, byte for byte: they were "
+        "not taken anew, and are left out",
+    )
+
+
 def _same_bytes(a: Path, b: Path) -> bool:
     try:
         return a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes()

@@ -17,7 +17,7 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_text, read_yaml
 from rsgen.geometry import se3
-from rstrack.bench.definitions import StrictModel
+from rstrack.bench.cells import StrictModel
 from rstrack.data.estimate import INFO, TRAJECTORY, Estimate, read_info
 
 METHOD = "method.yaml"

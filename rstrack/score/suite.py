@@ -1,18 +1,26 @@
-"""The sequences that trajectories are scored on: a folder of them, with or without a suite.yaml.
+"""The suite, a folder of sequences that trajectories are scored on; and running our methods and peers on it.
 
 suite = read_suite(Path("suite"), only=("small",))
+outcome = run_methods(suite, ("rs-pg", "kiss-icp"), Path("out/runs"))
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from rsgen.console.progress import Progress, no_progress
+from rsgen.console.scheduler import open_workers
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
+from rstrack.bench.cells import OTHERS, Benchmark, CaseEntry, Cell, MethodEntry, SequenceEntry
+from rstrack.bench.experiments.methods import chosen_methods
+from rstrack.bench.runner import Outcome, run_cells
+from rstrack.bench.task import Sources
 
 SUITE = "suite.yaml"
 # Any of them makes a folder a sequence.
@@ -88,3 +96,28 @@ def read_suite(root: Path, only: tuple[str, ...] = ()) -> Suite:
 def _matches(entry: SuiteEntry, patterns: tuple[str, ...]) -> bool:
     words = (entry.name, entry.tier, entry.role, entry.group)
     return any(fnmatchcase(word, pattern) for word in words for pattern in patterns)
+
+
+_PEERS = "peers"
+
+
+def run_methods(
+    suite: Suite, methods: Sequence[str], out: Path, scheduler: str | None = None, progress: Progress = no_progress
+) -> Outcome:
+    """Track every sequence that is there; what `out` holds already is kept. Records say what failed.
+
+    methods: names of ours and of peers; 'peers': all of these. A cell that fails, or whose package is absent, leaves no
+    run. Raises UserError: a name that there is not, a folder that cannot be written.
+    """
+    named = [name for name in methods if name != _PEERS]
+    chosen = chosen_methods(named, OTHERS if _PEERS in methods else ())
+    cells = tuple(
+        Cell("track", entry.name, method, (0,), CaseEntry(sequence=entry.name), path, MethodEntry(), {})
+        for entry in suite.entries
+        if (suite.root / entry.name).is_dir()
+        for path in [SequenceEntry(path=Path(entry.name), group=entry.tier)]
+        for method in chosen
+    )
+    sources = Sources(data=suite.root.resolve(), scheduler=scheduler)
+    with open_workers(scheduler) as workers:
+        return run_cells(Benchmark(cells), out, sources, workers, progress)

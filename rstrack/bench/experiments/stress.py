@@ -21,13 +21,12 @@ from rsgen.errors import UserError, first_problem
 from rsgen.files import atomic_write, encode_yaml, read_text, read_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.cells import Benchmark, Cell
-from rstrack.bench.definitions import CaseEntry, MethodEntry, SequenceEntry
+from rstrack.bench.cells import Benchmark, CaseEntry, Cell, MethodEntry, SequenceEntry
 from rstrack.bench.experiments.methods import given_options
 from rstrack.bench.measures.blur import weights_key
 from rstrack.bench.record import CellRecord
-from rstrack.bench.sequences import Sources
 from rstrack.bench.tables import failures
+from rstrack.bench.task import Sources
 from rstrack.options import Options
 
 STRESS = "stress.json"

@@ -11,7 +11,6 @@ from typing import Any
 from rsgen.console.progress import Progress
 from rsgen.console.tables import Entry, Table, fixed
 from rstrack.bench.cells import Benchmark
-from rstrack.bench.experiments.run import Written
 from rstrack.bench.experiments.stress import (
     PATHS,
     STRESS,
@@ -23,9 +22,9 @@ from rstrack.bench.experiments.stress import (
 )
 from rstrack.bench.measures.blur import read_panels
 from rstrack.bench.record import CellRecord, write_records
-from rstrack.bench.runner import Outcome
-from rstrack.bench.sequences import Sources
+from rstrack.bench.runner import Outcome, Written
 from rstrack.bench.tables import pivot, provenance, write_tables
+from rstrack.bench.task import Sources
 from rstrack.charts.chart import COLORS, TRUE_COLOR, Chart, Curve, numbers
 from rstrack.charts.to_file import write_charts
 

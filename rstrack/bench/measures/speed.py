@@ -18,10 +18,9 @@ from pydantic import Field
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rstrack.bench.definitions import StrictModel
+from rstrack.bench.cells import StrictModel
 from rstrack.bench.record import Figures
-from rstrack.bench.sequences import Absent
-from rstrack.bench.task import Task, settings_of
+from rstrack.bench.task import Absent, Task, settings_of
 from rstrack.data.dataset import registered_image
 from rstrack.data.registration import Registrar
 from rstrack.options import PEERS, Peer

@@ -23,8 +23,8 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import listed_file, read_text
 from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
-from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
-from rstrack.data.dataset import Dataset
+from rstrack.data.camera_file import CAMERA_FILES, EXAMPLE, RigFile, find_camera_file, read_rig
+from rstrack.data.dataset import Dataset, recorded_dataset
 from rstrack.data.image_files import (
     ImageFiles,
     decode_color,
@@ -32,8 +32,8 @@ from rstrack.data.image_files import (
     decode_image,
     first_size,
     repeated,
+    repeats_note,
 )
-from rstrack.data.layouts.recorded import CAMERA_FILES, RecordedFolder, find_camera_file, repeats_note
 from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages, read_own_intrinsics
 from rstrack.data.rig import Rig
 
@@ -66,7 +66,7 @@ def read(root: Path, camera_file: Path | None) -> Dataset:
     own_depth = read_own_intrinsics(root, "depth", stamps[0], file.rig.depth_camera)
     images = files if own_color is own_depth is None else SharedImages(files, own_color, own_depth)
     notes = (*depth_note, *color_note, *_own_notes(own_color, own_depth), *_truth_note(root))
-    return RecordedFolder(file, *stamps, images, _truth(root, file.rig), notes).dataset(root)
+    return recorded_dataset(root, file, *stamps, images, _truth(root, file.rig), notes)
 
 
 # --- listings --------------------------------------------------------------------------------------------------------
@@ -132,7 +132,7 @@ class _Listing:
         if not again.any():
             return self, ()
         new = tuple(entry for entry, is_repeat in zip(self.entries, again, strict=True) if not is_repeat)
-        return _Listing(self.root, self.file, new), (repeats_note(name, again),)
+        return _Listing(self.root, self.file, new), repeats_note(name, again)
 
     def _where(self, entry: _Entry) -> str:
         return f"{self.file} line {entry.line}"

@@ -25,8 +25,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import StreamName
 from rstrack.formats.bags.bag import BagReader
-from rstrack.formats.bags.messages import camera_of_info, items_of, transform_of
-from rstrack.formats.bags.topics import COMPRESSED, IMAGE, IMU, listed
+from rstrack.formats.bags.messages import COMPRESSED, IMAGE, IMU, camera_of_info, items_of, listed, transform_of
 from rstrack.formats.recording import ReadOptions, Recording, StreamCamera
 
 _DATA = re.compile(

@@ -13,8 +13,18 @@ from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import StreamName
 from rstrack.formats.bags import realsense
 from rstrack.formats.bags.bag import BagReader, Message, is_bag, open_bag
-from rstrack.formats.bags.messages import between, camera_of_info, items_of, stated_shutter
-from rstrack.formats.bags.topics import base_of, find_color, find_depth, find_imu, find_info, is_registered
+from rstrack.formats.bags.messages import (
+    base_of,
+    between,
+    camera_of_info,
+    find_color,
+    find_depth,
+    find_imu,
+    find_info,
+    is_registered,
+    items_of,
+    stated_shutter,
+)
 from rstrack.formats.pixels import is_float_depth
 from rstrack.formats.recording import FLOAT_DEPTH_SCALE, ReadOptions, Recording
 
