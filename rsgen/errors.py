@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import requires
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
+
+Model = TypeVar("Model")
 
 
 class UserError(Exception):
@@ -32,6 +34,19 @@ def how_to_install(*extras: str, package: str = "") -> str:
     if not found:
         raise ValueError(f"no package '{package}' in the extras {', '.join(extras)}")
     return "pip install " + " ".join(f"'{part}'" for part in found)
+
+
+def validated(validate: Callable[[Any], Model], data: Any, where: object, *within: str, cure: str = "") -> Model:
+    """The data as pydantic validates it: `validate` is a model's model_validate or model_validate_json.
+
+    Raises UserError, 'WHERE: FIELD: what is wrong with it' and the cure; `within`: the fields that the data lies in.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return validate(data)
+    except ValidationError as error:
+        raise UserError(f"{where}: {first_problem(error, *within)}{cure}") from None
 
 
 def first_problem(error: ValidationError, *within: str) -> str:

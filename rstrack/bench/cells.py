@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeFloat, model_validator
 
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import read_yaml
 from rstrack.metrics.truth_fit import TruthExtrinsics, TruthOffset
 from rstrack.options import CLOUD_PEERS, METHODS, PEERS, SLAM_PEERS, Options
@@ -139,12 +139,9 @@ class BenchmarkFile(StrictModel):
     )
 
 
-def validated(model: type[Model], path: Path, example: str) -> Model:
+def read_definitions(model: type[Model], path: Path, example: str) -> Model:
     """A YAML file as a model. Raises UserError naming the file and the entry."""
-    try:
-        return model.model_validate(read_yaml(path))
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)} ({example} is an example)") from None
+    return validated(model.model_validate, read_yaml(path), path, cure=f" ({example} is an example)")
 
 
 def beside(sequences: Mapping[str, SequenceEntry], folder: Path) -> dict[str, SequenceEntry]:
@@ -260,7 +257,7 @@ def frames_of(text: str | None) -> slice:
 
 
 def _load(path: Path) -> BenchmarkFile:
-    file = validated(BenchmarkFile, path, "benchmarks/gate.yaml")
+    file = read_definitions(BenchmarkFile, path, "benchmarks/gate.yaml")
     cases = {
         name: entry if entry.camera is None else entry.model_copy(update={"camera": path.parent / entry.camera})
         for name, entry in file.cases.items()

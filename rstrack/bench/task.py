@@ -21,11 +21,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from rsgen.console.configs import config_file, scaled
 from rsgen.console.progress import Progress, no_progress
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import atomic_write, read_bytes, read_text, read_yaml
 from rsgen.sequence.reader import read_sequence
 from rstrack.bench.cells import Cell, Model, SequenceEntry
@@ -220,7 +218,4 @@ def measure_named(where: str) -> Measure:
 
 def settings_of(task: Task, model: type[Model]) -> Model:
     """The task's settings as the measure has them. Raises UserError naming cell and setting."""
-    try:
-        return model.model_validate(dict(task.settings))
-    except ValidationError as error:
-        raise UserError(f"{task.cell.name}: settings: {first_problem(error)}") from None
+    return validated(model.model_validate, dict(task.settings), f"{task.cell.name}: settings")

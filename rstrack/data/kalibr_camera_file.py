@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Shutter
@@ -103,19 +103,12 @@ def is_camchain(data: dict[str, Any]) -> bool:
 def read_camchain(path: Path, data: dict[str, Any]) -> Camchain:
     """path: for messages. data: the file's content. Raises UserError, one line."""
     names = [f"cam{k}" for k in range(len(data)) if f"cam{k}" in data]
-    cams = {name: _cam(path, name, data[name]) for name in names}
+    cams = {name: validated(_Cam.model_validate, data[name], path, name) for name in names}
     color, depth = _roles(path, cams)
     T_cam_cam0 = _chain(path, cams)
     T = np.eye(4) if depth is None else T_cam_cam0[color] @ se3.inverse(T_cam_cam0[depth])
     found = {name: _camera(path, name, cams[name]) for name in (color, depth) if name is not None}
     return Camchain(found[color], None if depth is None else found[depth], se3.orthonormalise(T))
-
-
-def _cam(path: Path, name: str, data: Any) -> _Cam:
-    try:
-        return _Cam.model_validate(data)
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error, name)}") from None
 
 
 def _roles(path: Path, cams: dict[str, _Cam]) -> tuple[str, str | None]:

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import read_text, read_yaml
 from rsgen.geometry import se3
 from rstrack.bench.cells import StrictModel
@@ -178,9 +178,5 @@ def _run(run: Path, sequences: Sequence[str]) -> tuple[str, str, Result]:
 
 
 def _about(folder: Path) -> About:
-    if not (file := folder / METHOD).is_file():
-        return About()
-    try:
-        return About.model_validate(read_yaml(file))
-    except ValidationError as error:
-        raise UserError(f"{file}: {first_problem(error)}") from None
+    file = folder / METHOD
+    return validated(About.model_validate, read_yaml(file), file) if file.is_file() else About()

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.scheduler import open_workers
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import read_yaml
 from rstrack.bench.cells import OTHERS, Benchmark, CaseEntry, Cell, MethodEntry, SequenceEntry
 from rstrack.bench.experiments.methods import chosen_methods
@@ -75,10 +75,7 @@ def read_suite(root: Path, only: tuple[str, ...] = ()) -> Suite:
     if not root.is_dir():
         raise UserError(f"{root}: no such folder: give one that holds folders of sequences")
     if (file := root / SUITE).is_file():
-        try:
-            found = _SuiteFile.model_validate(read_yaml(file))
-        except ValidationError as error:
-            raise UserError(f"{file}: {first_problem(error)}") from None
+        found = validated(_SuiteFile.model_validate, read_yaml(file), file)
     else:
         folders = sorted(p.name for p in root.iterdir() if any((p / name).is_file() for name in _SEQUENCE_FILES))
         if not folders:

@@ -18,9 +18,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, model_validator
 
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import read_text
 from rstrack.bench.cells import (
     OTHERS,
@@ -32,7 +32,7 @@ from rstrack.bench.cells import (
     SequenceEntry,
     StrictModel,
     beside,
-    validated,
+    read_definitions,
 )
 from rstrack.bench.figures import PaperFigures, paper_average
 from rstrack.bench.record import CellRecord, figure
@@ -96,7 +96,7 @@ class Plan:
 
 def load_methods(path: Path) -> MethodsConfig:
     """Read and validate a file such as configs/evaluation.yaml. Raises UserError naming the file and the entry."""
-    config = validated(MethodsConfig, path, "configs/evaluation.yaml")
+    config = read_definitions(MethodsConfig, path, "configs/evaluation.yaml")
     return config.model_copy(update={"sequences": beside(config.sequences, path.parent)})
 
 
@@ -329,7 +329,4 @@ def better_pct(value: float | None, baseline: float | None) -> float | None:
 
 def read_results(path: Path) -> Results:
     """Read and check results.json. Raises UserError naming the first wrong field."""
-    try:
-        return Results.model_validate_json(read_text(path))
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)}: run 'rstrack bench' again") from None
+    return validated(Results.model_validate_json, read_text(path), path, cure=": run 'rstrack bench' again")

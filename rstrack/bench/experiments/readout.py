@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from rsgen.console.progress import Progress
 from rsgen.console.tables import NOTHING, Entry, Table, fixed, significant
-from rsgen.errors import UserError, first_problem, how_to_install
+from rsgen.errors import UserError, how_to_install, validated
 from rsgen.files import read_yaml
 from rstrack.bench.cells import (
     OTHERS,
@@ -31,7 +31,7 @@ from rstrack.bench.cells import (
     NoiseEntry,
     SequenceEntry,
     StrictModel,
-    validated,
+    read_definitions,
 )
 from rstrack.bench.experiments.methods import method_entry, variants
 from rstrack.bench.figures import heading
@@ -98,7 +98,7 @@ class SweepConfig(StrictModel):
 
 def load_sweep(path: Path) -> SweepConfig:
     """Read and validate; paths come out relative to the working directory. Raises UserError naming file and entry."""
-    config = validated(SweepConfig, path, "configs/readout_sweep.yaml")
+    config = read_definitions(SweepConfig, path, "configs/readout_sweep.yaml")
     here = tuple(entry.model_copy(update={"config": path.parent / entry.config}) for entry in config.motions)
     return config.model_copy(update={"motions": here})
 
@@ -119,10 +119,7 @@ def narrow(
         "noise": config.noise.model_dump() | ({} if seeds is None else {"seeds": seeds}),
     }
     chosen |= {name: value for name, value in given.items() if value}
-    try:
-        return SweepConfig.model_validate(chosen)
-    except ValidationError as error:
-        raise UserError(f"the sweep: {first_problem(error)}") from None
+    return validated(SweepConfig.model_validate, chosen, "the sweep")
 
 
 def installed(methods: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from rsgen.console.progress import Progress
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import atomic_write, read_text
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png, read_png
@@ -91,10 +91,7 @@ def read_panels(folder: Path) -> Panels | None:
     if not folder.is_dir():
         return None
     path = folder / "panels.json"
-    try:
-        return Panels.model_validate_json(read_text(path))
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)}") from None
+    return validated(Panels.model_validate_json, read_text(path), path)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
