@@ -216,9 +216,8 @@ def score(
     from rsgen.files import atomic_write, write_error
     from rstrack.report.leaderboard import leaderboard, summary
     from rstrack.report.page import write_page
-    from rstrack.score.results import find_methods
     from rstrack.score.scores import score_suite
-    from rstrack.score.suite import read_suite
+    from rstrack.score.suite import find_methods, read_suite
 
     chosen = read_suite(suite, only or ())
     names = [entry.name for entry in chosen.entries]

@@ -13,8 +13,8 @@ holds. `rstrack calibrate` finds both and writes such a file. clocks: {NAME: {of
 recording in a folder of that name alone. color.falloff: see `Rig`; auto: `track` finds it. stamps: see there, too.
 sigma: {focal: 0.01, center_px: 3, ...}: how far this may be wrong, see `CalibrationSigma`; the rest is by default.
 depth.registered: warped into the colour camera, see `rstrack.data.registration`. depth.offset_s: seconds added to
-depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see
-`rstrack.data.kalibr_camera_file`. A run.json holds the cameras of its run in the same form (`camera_content`).
+depth's stamps. calibration.yaml and Kalibr's camchain.yaml: see `rstrack.data.foreign_camera_files`. A run.json holds
+the cameras of its run in the same form (`camera_content`).
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
 from rstrack.data.estimate import read_info
-from rstrack.data.kalibr_camera_file import Camchain, is_camchain, read_camchain
-from rstrack.data.opencv_camera_file import is_opencv, opencv_content
+from rstrack.data.foreign_camera_files import Camchain, is_camchain, is_opencv, opencv_content, read_camchain
 from rstrack.data.registration import DepthSensor, registered_shutter
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Rig, rigid_transform, sigma_of_file
 from rstrack.data.timing import StampsMode

@@ -16,9 +16,8 @@ from rstrack.bench.figures import figure_of, heading
 from rstrack.charts.chart import Chart, Curve, method_colors, numbers
 from rstrack.charts.to_file import write_charts
 from rstrack.report.page import Chooser, ImageRow, Note, Page, PageImage, PageSection, Sortable
-from rstrack.score.results import MethodResults
 from rstrack.score.scores import FIGURES, Scores, SequenceScored
-from rstrack.score.suite import SuiteEntry
+from rstrack.score.suite import MethodResults, SuiteEntry
 
 _BY_READOUT = ("ate_mm", "drift_mm_s")
 _ABOUT = (

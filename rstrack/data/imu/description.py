@@ -24,7 +24,7 @@ from rsgen.errors import UserError, first_problem
 from rsgen.files import parse_yaml, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.limits import rigid
-from rstrack.data.kalibr_camera_file import is_camchain, read_camchain
+from rstrack.data.foreign_camera_files import is_camchain, read_camchain
 from rstrack.data.rig import rigid_transform
 
 

@@ -2,7 +2,7 @@
 
     rgb.txt, depth.txt    'stamp path' lines; or associations.txt with 'stamp path stamp path', depth or colour first
     intrinsics.csv        optional: of each image; see `rstrack.data.own_intrinsics`
-    camera.yaml           the cameras: see `camera_file`; or an OpenCV calibration.yaml: see `opencv_camera_file`
+    camera.yaml           the cameras: see `camera_file`; or an OpenCV calibration.yaml: see `foreign_camera_files`
     groundtruth.txt       optional: poses of the colour camera; ICL-NUIM's NAME.gt.freiburg also
 
 Stamps without any decimal point are frame numbers at 30 Hz, as in ICL-NUIM. Colour images are 8-bit PNG or JPEG, depth
