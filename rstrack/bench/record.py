@@ -21,6 +21,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
 from rstrack.bench.cells import OTHERS
@@ -159,6 +162,12 @@ def counts(figures: Mapping[str, float | None]) -> bool:
 def figure(record: CellRecord | None, name: str) -> float | None:
     """A figure of a record; None where it failed, the track is lost or lacks it."""
     return record.figures.get(name) if record is not None and record.is_good else None
+
+
+def frame_times(ms: FloatArray) -> Figures:
+    """What frames took (n,), ms: median, mean and tails."""
+    tails = {f"p{part}_ms": float(np.percentile(ms, part)) for part in (95, 99)}
+    return {"median_ms": float(np.median(ms)), "mean_ms": float(ms.mean()), **tails}
 
 
 def methods_in_order(records: Iterable[CellRecord]) -> list[str]:

@@ -34,7 +34,7 @@ from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
 from rstrack.data.estimate import read_info
 from rstrack.data.foreign_camera_files import Camchain, is_camchain, is_opencv, opencv_content, read_camchain
-from rstrack.data.registration import DepthSensor, registered_shutter
+from rstrack.data.registration import registered_shutter
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Rig, rigid_transform, sigma_of_file
 from rstrack.data.timing import StampsMode
 
@@ -282,8 +282,7 @@ def _depth_shutter(
     if depth.sensor is None:
         return depth.shutter, 0.0, ()
     T = rigid_transform("depth.sensor.T_color_sensor", depth.sensor.T_color_sensor or np.eye(4))
-    sensor = DepthSensor(depth.sensor.camera("depth.sensor"), depth.shutter, T)
-    return *registered_shutter(camera, sensor), ()
+    return *registered_shutter(camera, depth.sensor.camera("depth.sensor"), depth.shutter, T), ()
 
 
 def _first(error: ValidationError) -> str:

@@ -99,29 +99,22 @@ _DEPTHS = (1.0, 2.0, 4.0)
 _EVERY = 8
 
 
-@dataclass(frozen=True)
-class DepthSensor:
-    """The camera that depth was warped from, its shutter, and T_color_sensor (4, 4) to the camera warped into."""
-
-    camera: Camera
-    shutter: Shutter
-    T_color_sensor: FloatArray
-
-
-def registered_shutter(camera: Camera, sensor: DepthSensor) -> tuple[Shutter, float]:
+def registered_shutter(
+    camera: Camera, sensor: Camera, shutter: Shutter, T_color_sensor: FloatArray
+) -> tuple[Shutter, float]:
     """The shutter of images of `camera` that were warped from a sensor, and seconds to add to the sensor's stamps.
 
-    Least squares over pixels and depths. Raises UserError if the sensor sees none of them, or its lines do not run
-    along those of the image.
+    shutter: the sensor's; T_color_sensor (4, 4): from it to the camera warped into. Least squares over pixels and
+    depths. Raises UserError if the sensor sees none of them, or its lines do not run along those of the image.
     """
     pixels = camera.pixel_grid()[::_EVERY, ::_EVERY].reshape(-1, 2)
-    line = sensor.shutter.line_of_pixel(pixels, camera)
+    line = shutter.line_of_pixel(pixels, camera)
     rays = camera.unproject(pixels)
     seen_line, on_line = [], []
     for z in _DEPTHS:
-        uv, _ = sensor.camera.project(se3.transform(se3.inverse(sensor.T_color_sensor), rays * z))
-        seen = sensor.camera.contains(uv)
-        seen_line.append(sensor.shutter.line_of_pixel(uv[seen], sensor.camera))
+        uv, _ = sensor.project(se3.transform(se3.inverse(T_color_sensor), rays * z))
+        seen = sensor.contains(uv)
+        seen_line.append(shutter.line_of_pixel(uv[seen], sensor))
         on_line.append(line[seen])
     x, y = np.concatenate(on_line), np.concatenate(seen_line)
     slope = 0.0
@@ -129,6 +122,6 @@ def registered_shutter(camera: Camera, sensor: DepthSensor) -> tuple[Shutter, fl
         slope, first = np.polyfit(x, y, 1)
     if slope <= 0.1:
         raise UserError("depth.sensor: does not see what registered depth shows: check intrinsics and T_color_sensor")
-    delay = sensor.shutter.line_delay(sensor.camera)
-    readout = slope * delay * sensor.shutter.line_count(camera)
-    return replace(sensor.shutter, readout_s=float(readout)), float(first * delay)
+    delay = shutter.line_delay(sensor)
+    readout = slope * delay * shutter.line_count(camera)
+    return replace(shutter, readout_s=float(readout)), float(first * delay)

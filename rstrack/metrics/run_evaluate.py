@@ -8,9 +8,10 @@ tracked = load_run(Path("runs/fr1_rpy"))       # what pictures and pages are mad
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -33,6 +34,11 @@ from rstrack.metrics.truth_fit import (
     mounted,
     shifted,
 )
+
+Found = TypeVar("Found")
+
+# Points of the true path, of which there is one at any time.
+_PATH_POINTS = 1000
 
 
 @dataclass(frozen=True)
@@ -141,7 +147,8 @@ def add_errors(run: Path, truth: Truth | None, estimate: Estimate, online: Estim
 
     online: the track before it was corrected. Raises UserError.
     """
-    evaluation, before = evaluated(truth, estimate), None if online is None else _metrics(truth, online)
+    evaluation = evaluated(truth, estimate)
+    before = None if online is None else _or_none(evaluate, truth, online)
     errors: dict[str, Any] = {
         "metrics": None if evaluation is None else evaluation.metrics.as_dict(),
         "truth_offset": None if evaluation is None else evaluation.truth_offset,
@@ -155,18 +162,7 @@ def add_errors(run: Path, truth: Truth | None, estimate: Estimate, online: Estim
 
 def evaluated(truth: Truth | None, estimate: Estimate) -> RunEvaluation | None:
     """`evaluate_clocks`; None without a truth, and where fewer than three poses have a true counterpart."""
-    try:
-        return None if truth is None else evaluate_clocks(truth, estimate)
-    except UserError:
-        return None
-
-
-def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
-    """`evaluate` with the clocks as they are; None as `evaluated`."""
-    try:
-        return None if truth is None else evaluate(truth, estimate)
-    except UserError:
-        return None
+    return _or_none(evaluate_clocks, truth, estimate)
 
 
 def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> RunEvaluation:
@@ -178,7 +174,7 @@ def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None
     """
     metrics = evaluate(truth, estimate)
     if offset is None:
-        fit = None if isinstance(truth.motion, Spline) else _fit_or_none(truth, estimate)
+        fit = None if isinstance(truth.motion, Spline) else _or_none(fit_clock, truth, estimate)
         if fit is None or not fit.is_clear:
             return RunEvaluation(metrics)
         return RunEvaluation(metrics, fit.offset_s, evaluate(shifted(truth, fit.offset_s), estimate), fit)
@@ -240,9 +236,10 @@ def _truth(path: Path, run: Path, estimate: Estimate, camera_file: Path | None) 
     return truth
 
 
-def _fit_or_none(truth: Truth, estimate: Estimate) -> ClockFit | None:
+def _or_none(compared: Callable[[Truth, Estimate], Found], truth: Truth | None, estimate: Estimate) -> Found | None:
+    """What a comparison finds; None without a truth, and where it raises UserError."""
     try:
-        return fit_clock(truth, estimate)
+        return None if truth is None else compared(truth, estimate)
     except UserError:
         return None
 
@@ -252,10 +249,6 @@ def _short(m: Metrics) -> str:
     if m.rpe_trans_rmse_m_per_s is not None and m.rpe_rot_rmse_deg_per_s is not None:
         parts += [f"{1e3 * m.rpe_trans_rmse_m_per_s:.2f} mm/s", f"{m.rpe_rot_rmse_deg_per_s:.3f} deg/s"]
     return ", ".join(parts)
-
-
-# Points of the true path, of which there is one at any time.
-_PATH_POINTS = 1000
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,8 @@ from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.estimate import Estimate
-from rstrack.metrics.association import Truth, align, angles_deg, true_poses
-from rstrack.metrics.evaluate import pairs_one_second_apart
+from rstrack.metrics.association import Truth, align, true_poses
+from rstrack.metrics.evaluate import motions, pairs_one_second_apart, pose_errors
 
 TruthOffset = float | Literal["auto"]
 """Seconds after a stamp that the truth is looked up, or 'auto': those at which the errors are least."""
@@ -162,11 +162,9 @@ class _Errors:
 
     def drift(self, tau: float) -> FloatArray:
         """Angles, degrees, and distances, m, of the relative poses' errors (2, k)."""
-        T_true = self.true_poses(tau)
-        true_step = se3.inverse(T_true[self.i]) @ T_true[self.j]
-        est_step = se3.inverse(self.T_est[self.i]) @ self.T_est[self.j]
-        distance = np.linalg.norm((se3.inverse(true_step) @ est_step)[:, :3, 3], axis=1)
-        return np.stack([angles_deg(true_step, est_step), distance])
+        true_step, est_step = (motions(T, self.i, self.j) for T in (self.true_poses(tau), self.T_est))
+        distance, angle = pose_errors(true_step, est_step)
+        return np.stack([angle, distance])
 
     def mean_drift(self, criterion: int, tau: float) -> float:
         """Mean of a row of `drift`."""
@@ -272,7 +270,7 @@ def fit_extrinsics(truth: Truth, estimate: Estimate) -> ExtrinsicsFit:
         raise UserError(
             f"estimate: {len(i)} pairs of poses one second apart have a truth, its extrinsics need {LEAST_PAIRS}"
         )
-    body, camera = (se3.inverse(T[i]) @ T[j] for T in (T_true, T_est))
+    body, camera = (motions(T, i, j) for T in (T_true, T_est))
     _refuse_few_turns(body)
     R, p = _closed_form(body, camera)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -31,21 +31,11 @@ _NEAREST_M = 0.1
 _PACKAGES = {"kiss-icp": "kiss-icp", "small-gicp": "small_gicp"}
 
 
-class CloudTracker(Protocol):
-    """A peer. settings: for run.json."""
-
-    settings: dict[str, float]
-
-    def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
-        """T_world_cam (4, 4) at the last line, from points (n, 3) in m that were seen at times `line` (n,), see
-        `cloud_of`."""
-
-
 class KissIcp:
     """KISS-ICP (Vizzo et al., RA-L 2023): point to point against a voxel map, deskewed to the end of each scan.
 
     It takes a scan to last as long as the time between two, whatever it is given: shorter readouts are deskewed too
-    much.
+    much. settings: for run.json.
     """
 
     def __init__(self, max_depth: float) -> None:
@@ -59,7 +49,8 @@ class KissIcp:
         self._odometry = module.KissICP(config)
 
     def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
-        """See `CloudTracker`."""
+        """T_world_cam (4, 4) at the last line, from points (n, 3) in m that were seen at times `line` (n,), see
+        `cloud_of`."""
         # It stretches the times to 0..1: where all are alike, which it would divide by, nothing is to be deskewed.
         self._odometry.register_frame(p_cam, line if np.ptp(line) > 0.0 else np.empty(0))
         return np.array(self._odometry.last_pose)
@@ -76,7 +67,7 @@ class SmallGicp:
         self._T_world_key = self._T_world_last = self._delta = np.eye(4)
 
     def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
-        """See `CloudTracker`."""
+        """See `KissIcp`."""
         points = deskewed(p_cam, line, self._delta)
         cloud = self._gicp.preprocess_points(points, self.settings["downsampling_resolution"])
         if self._key is None:
@@ -152,7 +143,7 @@ def cloud_of(dataset: Dataset) -> Callable[[int], tuple[FloatArray, FloatArray]]
     return cloud
 
 
-def _tracker(name: str) -> CloudTracker:
+def _tracker(name: str) -> KissIcp | SmallGicp:
     if name not in CLOUD_PEERS:
         raise UserError(f"unknown peer '{name}': choose {', '.join(CLOUD_PEERS)}")
     return KissIcp(Options().max_depth) if name == "kiss-icp" else SmallGicp(Options())

@@ -26,6 +26,7 @@ from rstrack.report.page import Card, CardRow, Note, Page, PageSection, Plot, nu
 from rstrack.report.pictures import frame_panels, shutter_sliders
 
 REPORT = "report.html"
+_AS_STORED = "table, path and curves go by the truth's clock as stored; --truth-offset auto: by the fitted one"
 
 
 def write_report(
@@ -68,9 +69,6 @@ def _page(
             "or 'rstrack bench' wrote"
         )
     return run_page(folder, sequence, camera_file, truth_offset)
-
-
-_AS_STORED = "table, path and curves go by the truth's clock as stored; --truth-offset auto: by the fitted one"
 
 
 def run_page(

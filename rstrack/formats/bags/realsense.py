@@ -23,6 +23,7 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
+from rsgen.limits import rigid
 from rsgen.sequence.format import StreamName
 from rstrack.formats.bags.bag import BagReader
 from rstrack.formats.bags.messages import COMPRESSED, IMAGE, IMU, camera_of_info, items_of, listed, transform_of
@@ -118,12 +119,9 @@ def _of_text(text: str) -> FloatArray | None:
         T = np.eye(4)
         T[:3, :3] = np.array(parts["rotation"].split(","), float).reshape(3, 3).T
         T[:3, 3] = np.array(parts["translation"].split(","), float)
+        return se3.orthonormalise(rigid(T, 1e-3))
     except (ValueError, KeyError):
         return None
-    R = T[:3, :3]
-    if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        return None
-    return se3.orthonormalise(T)
 
 
 def _between(to: dict[int, FloatArray], from_: dict[int, FloatArray]) -> FloatArray | None:
