@@ -30,7 +30,6 @@ from rstrack.bench.cells import Cell, Model, SequenceEntry
 from rstrack.bench.changes import changed
 from rstrack.bench.record import Figures
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.image_files import NoisyImages
 from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
 
@@ -198,10 +197,7 @@ class Task:
     def noisy(self) -> Dataset:
         """The same with the noise in its images, for those that do not add it themselves."""
         n = self.noise
-        if not (n.sigma_depth or n.sigma_intensity):
-            return self.dataset
-        images = NoisyImages(self.dataset.images, n.sigma_depth, n.sigma_intensity, n.seed)
-        return dataclasses.replace(self.dataset, images=images)
+        return self.dataset.noisy(n.sigma_depth, n.sigma_intensity, n.seed)
 
     @property
     def frames(self) -> range:

@@ -14,6 +14,7 @@ from rsgen.console.command_line import Alone, Frames, Json, Quiet
 from rsgen.device.backend import Backend
 from rsgen.errors import UserError
 from rstrack.cli.options import CameraFile, DeviceName, ImuFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
+from rstrack.cli.results import RunSequence
 from rstrack.options import Options
 
 if TYPE_CHECKING:
@@ -169,17 +170,12 @@ def calibrate(
     from rstrack.calibration.run import calibrate as calibrate_cameras
     from rstrack.calibration.several import check_alike, together
     from rstrack.data.dataset import open_dataset
-    from rstrack.data.image_files import NoisyImages
     from rstrack.report.calibration import calibration_page
     from rstrack.report.page import write_page
 
     known = None if device is None else device_named(device)
     groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
-    datasets = [open_dataset(path, camera) for path in sequence]
-    if noise_depth or noise_intensity:
-        datasets = [
-            replace(each, images=NoisyImages(each.images, noise_depth, noise_intensity, seed)) for each in datasets
-        ]
+    datasets = [open_dataset(path, camera).noisy(noise_depth, noise_intensity, seed) for path in sequence]
     dataset, first = datasets[0], sequence[0]
     if len(datasets) > 1 and (report is not None or json or groups == ("imu",)):
         raise UserError("--report, --json and --free imu: are of one recording: give one")
@@ -244,7 +240,7 @@ def _imu(
 def refine(
     run: Annotated[Path, "folder that 'rstrack track' wrote, of a method with a spline"],
     *,
-    sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,
+    sequence: RunSequence = None,
     camera: CameraFile = None,
     imu: ImuFile = None,
     out: Annotated[Path, "folder for the refined run, made if need be", "DIR"],

@@ -25,7 +25,7 @@ from rsgen.sequence.images import Sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, camera_content, run_cameras
 from rstrack.data.estimate import INFO
-from rstrack.data.image_files import ImageReader, prefetched
+from rstrack.data.image_files import ImageReader, NoisyImages, prefetched
 from rstrack.data.imu.recording import ImuFiles, ImuRecording, ReadImu, find_imu
 from rstrack.data.layouts import LAYOUTS, layout_of
 from rstrack.data.registration import RegisteredImage, Registrar
@@ -74,6 +74,13 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def chosen(self, frames: slice) -> range:
+        """The numbers of these frames. Raises UserError: there are none."""
+        chosen = range(len(self))[frames]
+        if not len(chosen):
+            raise UserError(f"{self.root}: has no frame {frames.start}: its frames are 0 to {len(self) - 1}")
+        return chosen
 
     def interval_s(self, frames: range) -> float | None:
         """The median time from one of these frames to the next, s; None of a single one."""
@@ -163,6 +170,12 @@ class Dataset:
             self, rig=replace(self.rig, sigma=sigma), color_stamps=color_stamps, groups=groups, timing=timing,
             color_drift=drift,
         )  # fmt: skip
+
+    def noisy(self, sigma_depth: float, sigma_intensity: float, seed: int) -> Dataset:
+        """The same recording with noise in its images, see `rstrack.data.image_files.with_noise`."""
+        if not (sigma_depth or sigma_intensity):
+            return self
+        return replace(self, images=NoisyImages(self.images, sigma_depth, sigma_intensity, seed))
 
     def with_color_falloff(self, falloff: float, note: str = "") -> Dataset:
         """The same recording with colours that are known to darken so towards the corners, see `Rig`.

@@ -23,7 +23,7 @@ from rsgen.geometry import se3
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.options import CLOUD_PEERS, Options
-from rstrack.peers.peer import chosen_frames, run_info, timed_frames
+from rstrack.peers.peer import run_info, timed_frames
 
 # Pixels of a depth image are thinned out to about so many.
 _POINTS = 40_000
@@ -107,7 +107,7 @@ def run_cloud_peer(
 
     Raises UserError: unknown name, the peer is not installed, no such frames, an image cannot be read or holds nothing.
     """
-    chosen, tracker = chosen_frames(dataset, frames), _tracker(name)
+    chosen, tracker = dataset.chosen(frames), _tracker(name)
     poses: list[FloatArray] = []
 
     def feed(k: int, cloud: tuple[FloatArray, FloatArray]) -> None:

@@ -36,7 +36,7 @@ from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.registration import RegisteredImage, Registrar
 from rstrack.options import Options
-from rstrack.peers.peer import chosen_frames, mid_readout_s, run_info, run_logged
+from rstrack.peers.peer import mid_readout_s, run_info, run_logged
 
 NAME = "orb-slam3"
 VOCABULARY = "RSTRACK_ORB_VOCABULARY"
@@ -60,7 +60,7 @@ def run_orb_slam3(
     readout, and interpolated to the stamp. seed: of the vocabulary. Raises UserError: it is not installed, no such
     frames, an image cannot be read, its process fails, nothing was tracked.
     """
-    chosen = chosen_frames(dataset, frames)
+    chosen = dataset.chosen(frames)
     if find_spec("pyorbslam3") is None:
         raise UserError(f"the peer needs pyorbslam3 (GPL): {how_to_install('orbslam3')}")
     registrar = Registrar(dataset.rig)

@@ -79,14 +79,6 @@ def run_logged(words: Sequence[str], log: Path, folder: Path | None = None) -> s
     return f"ended with status {done.returncode}: {last}" if done.returncode else ""
 
 
-def chosen_frames(dataset: Dataset, frames: slice) -> range:
-    """The frames of a dataset. Raises UserError: there are none."""
-    chosen = range(len(dataset))[frames]
-    if not len(chosen):
-        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
-    return chosen
-
-
 def timed_frames(
     name: str, chosen: range, read: Callable[[int], Input], feed: Callable[[int, Input], object], progress: Progress
 ) -> list[float]:

@@ -189,7 +189,6 @@ def _render_command(name: str, entry: SequenceEntry, data: Path, frames: slice) 
 
 def _kept(dataset: Dataset, command: str, frames: slice) -> range:
     """The frames that are run. Raises UserError: there are none, or fewer than are wanted have been rendered."""
-    chosen = range(len(dataset))[frames]
     if dataset.sequence is not None and (frames.stop is None or frames.stop > len(dataset)):
         there, in_all = min((len(s.paths), s.frames) for s in dataset.sequence.streams.values())
         if there < in_all:
@@ -197,9 +196,7 @@ def _kept(dataset: Dataset, command: str, frames: slice) -> range:
                 f"{dataset.root}: {there} of {in_all} frames are rendered: finish it with '{command}', leave it out "
                 f"with --sequence, or track what there is with --frames 0:{there}"
             )
-    if not len(chosen):
-        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
-    return chosen
+    return dataset.chosen(frames)
 
 
 def variants(method: str, fuse: bool | None) -> tuple[str, ...]:
