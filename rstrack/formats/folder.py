@@ -30,7 +30,7 @@ from rsgen.sequence.trajectory import MAX_POSITION_M, MIN_POSES
 from rstrack.data.imu.description import imu_yaml
 from rstrack.data.imu.recording import IMU_YAML
 from rstrack.data.layouts.tum_folder import ESTIMATED
-from rstrack.data.own_intrinsics import FILES
+from rstrack.data.registration import FILES
 from rstrack.formats.recording import ImageIntrinsics, ImuSample, RecordedImage, RecordedPose, Recording, StreamCamera
 
 RECORD = "import.json"

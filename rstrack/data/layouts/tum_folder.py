@@ -1,7 +1,7 @@
 """Folders in the layout of TUM RGB-D, among them Kerl et al.'s rolling-shutter sets, and of ICL-NUIM.
 
     rgb.txt, depth.txt    'stamp path' lines; or associations.txt with 'stamp path stamp path', depth or colour first
-    intrinsics.csv        optional: of each image; see `rstrack.data.own_intrinsics`
+    intrinsics.csv        optional: of each image; see `rstrack.data.registration`
     camera.yaml           the cameras: see `camera_file`; or an OpenCV calibration.yaml: see `foreign_camera_files`
     groundtruth.txt       optional: poses of the colour camera; ICL-NUIM's NAME.gt.freiburg also
 
@@ -34,7 +34,7 @@ from rstrack.data.image_files import (
     repeated,
     repeats_note,
 )
-from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages, read_own_intrinsics
+from rstrack.data.registration import OwnIntrinsics, SharedImages, read_own_intrinsics
 from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")

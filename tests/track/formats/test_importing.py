@@ -21,7 +21,7 @@ from rsgen.image_codecs import encode_png
 from rstrack import formats
 from rstrack.cli.info import describe
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.own_intrinsics import SharedImages
+from rstrack.data.registration import SharedImages
 
 # --- others ----------------------------------------------------------------------------------------------------------
 
