@@ -30,7 +30,7 @@ MAX_POSITION_M = 1e4
 """Positions farther than this from the origin are refused: millimetres, or map coordinates, by mistake."""
 
 MIN_POSES = 4
-_MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
+MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
 _ICL_Z_OFFSET_M = -2.25  # the published files put frame 1 at z = -2.25
 _FIELDS = {"tum": 8, "icl": 8, "euroc": 8}
 _LAYOUT = {
@@ -130,7 +130,7 @@ def read_trajectory(
         )
         stamps = stamps / ICL_RATE_HZ
     check(
-        np.abs(stamps) < _MAX_STAMP_S,
+        np.abs(stamps) < MAX_STAMP_S,
         lambda i: f"has the stamp {stamps[i]:.6g}, absurd in seconds: divide by 1e9 if these are nanoseconds",
     )
     _check_stamps(check, stamps, max_gap_s)

@@ -21,6 +21,7 @@ from rsgen.errors import UserError
 from rsgen.files import listed_file, read_bytes, read_text
 from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png, png_fault
+from rsgen.sequence.trajectory import MAX_STAMP_S
 from rstrack.formats.pixels import check_size, decode, header_size
 from rstrack.formats.recording import (
     ARKIT_TRUTH,
@@ -38,7 +39,7 @@ from rstrack.formats.recording import (
 )
 
 _MILLIMETRES = 1000.0
-_MAX_STAMP_S, _MOST_FRAMES = 1e11, 10**9
+_MOST_FRAMES = 10**9
 # Kinds of the first box of a QuickTime or MP4 file. FFmpeg opens lists of other files, and addresses, by any name.
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _POSE, _INTRINSICS = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
@@ -100,7 +101,7 @@ def _table(path: Path, wanted: Sequence[str]) -> list[dict[str, float]]:
         needed = [*wanted, *(_INTRINSICS if "fx" in names else ())]
         if not all(math.isfinite(row.get(name, math.nan)) for name in needed if name not in _POSE):
             raise UserError(f"{path} line {number}: expected numbers for {', '.join(needed)}")
-        if abs(row["timestamp"]) > _MAX_STAMP_S or not 0 <= row.get("frame", 0.0) < _MOST_FRAMES:
+        if abs(row["timestamp"]) > MAX_STAMP_S or not 0 <= row.get("frame", 0.0) < _MOST_FRAMES:
             raise UserError(f"{path} line {number}: no recording has that time or number of a frame: it is damaged")
         found.append({name: math.nan for name in names} | row)
     return found

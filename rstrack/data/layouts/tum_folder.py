@@ -22,7 +22,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import listed_file, read_text
-from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
+from rsgen.sequence.trajectory import ICL_RATE_HZ, MAX_STAMP_S, Trajectory, read_trajectory
 from rstrack.data.camera_file import CAMERA_FILES, EXAMPLE, RigFile, find_camera_file, read_rig
 from rstrack.data.dataset import Dataset, recorded_dataset
 from rstrack.data.image_files import (
@@ -40,7 +40,6 @@ from rstrack.data.rig import Rig
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
 ESTIMATED = "# estimated, not measured: "
 """Begins the first line of a groundtruth.txt whose poses are another estimate from the same images."""
-_MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
 
 
 def matches(root: Path) -> bool:
@@ -144,7 +143,7 @@ class _Listing:
             seconds = math.nan
         if not math.isfinite(seconds):
             raise UserError(f"{self._where(entry)}: {entry.stamp[:40]!r} is not a time in seconds")
-        if abs(seconds) > _MAX_STAMP_S:
+        if abs(seconds) > MAX_STAMP_S:
             raise UserError(
                 f"{self._where(entry)}: stamp {entry.stamp[:40]} is absurd in seconds: divide nanoseconds by 1e9"
             )
