@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 from rsgen.console.tables import Table
 from rsgen.files import atomic_write, write_error
-from rstrack.charts.chart import AnyChart, Chart, PathChart
-from rstrack.charts.to_page import PlotlyFigure, figure_of
+from rstrack.charts.chart import Chart, PathChart
+from rstrack.charts.to_page import AnyChart, PlotlyFigure, figure_of
 from rstrack.data.estimate import plain
 
 
