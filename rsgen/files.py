@@ -53,6 +53,14 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def make_folder(folder: Path, named: Path | None = None) -> None:
+    """Make a folder, and those above it, unless it is there. Raises UserError about what was named: by default it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(named or folder, error) from None
+
+
 def write_error(path: Path, error: OSError) -> UserError:
     """The one line for a failed write."""
     cure = {

@@ -21,7 +21,7 @@ import numpy as np
 from rsgen.array_types import ByteArray, Float32Array, FloatArray
 from rsgen.console.rerun import recording_file, rerun
 from rsgen.errors import UserError
-from rsgen.files import write_error
+from rsgen.files import make_folder
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -65,10 +65,7 @@ def open_view(file: Path | None, rig: Rig, name: str) -> Iterator[Viewer]:
         yield Viewer(rr, recording, rig)
         recording.flush()
         return
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(file, error) from None
+    make_folder(file.parent, file)
     with recording_file(file, "rstrack", name, "--view") as (rr, recording):
         yield Viewer(rr, recording, rig)
 

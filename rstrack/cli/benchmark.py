@@ -213,7 +213,7 @@ def score(
     and ms_per_frame.
     """
     from rsgen.console.progress import ProgressDisplay
-    from rsgen.files import atomic_write, write_error
+    from rsgen.files import atomic_write, make_folder
     from rstrack.report.leaderboard import leaderboard, summary
     from rstrack.report.page import write_page
     from rstrack.score.scores import score_suite
@@ -237,10 +237,7 @@ def score(
                 return 130
             given = find_methods((*results, out / "runs"), names)
         scores = score_suite(chosen, given, progress)
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise write_error(out, error) from None
+        make_folder(out)
         atomic_write(out / "scores.json", scores.json_text().encode())
         page = write_page(leaderboard(scores), out / "index.html")
     print(summary(scores))

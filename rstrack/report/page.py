@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rsgen.console.tables import Table
-from rsgen.files import atomic_write, write_error
+from rsgen.files import atomic_write, make_folder
 from rstrack.charts.chart import Chart, PathChart
 from rstrack.charts.to_page import AnyChart, PlotlyFigure, figure_of
 from rstrack.data.estimate import plain
@@ -198,10 +198,7 @@ def render(page: Page) -> str:
 def write_page(page: Page, out: Path) -> Path:
     """Write a page, its folder too if need be; returns its path. Raises UserError."""
     page = replace(page, made_with=f"rstrack {version('rolling-shutter-rgbd')}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(out, error) from None
+    make_folder(out.parent, out)
     atomic_write(out, render(page).encode())
     return out
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, read_text, write_error
+from rsgen.files import atomic_write, write_error
 from rstrack.bench.experiments.methods import MAPPED, Results, SequenceInfo, method_of
 from rstrack.bench.figures import PAPER_FIGURES
 from rstrack.bench.record import CellRecord, figure, read_record
@@ -24,6 +24,7 @@ from rstrack.charts.chart import Bars, Chart, method_colors, numbers
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.charts.to_file import write_charts
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import read_info
 from rstrack.mapping.map import run_map
 from rstrack.metrics.run_evaluate import Tracked, load_run
 from rstrack.options import MapOptions
@@ -227,10 +228,9 @@ def _draw(sequence: str, parts: list[dict[str, Any]], out: Path) -> Path:
 def _read(path: Path) -> dict[str, Any]:
     """A JSON object, empty if there is none."""
     try:
-        data = json.loads(read_text(path))
-    except (UserError, ValueError, RecursionError):
+        return read_info(path)
+    except UserError:
         return {}
-    return data if isinstance(data, dict) else {}
 
 
 def _json(record: dict[str, Any]) -> bytes:
