@@ -135,8 +135,8 @@ class Viewer:
             picture = rr.EncodedImage(contents=jpeg(frame.colors[0].pixels, _WIDTH), media_type="image/jpeg")
             log("world/camera/color/image", picture)
         stride = -(-frame.depth.pixels.shape[1] // _WIDTH)
-        z = _millimetres(frame.depth.pixels[::stride, ::stride])
-        log("world/camera/depth/image", rr.DepthImage(z, meter=1000.0))
+        z_mm = np.clip(np.rint(1e3 * frame.depth.pixels[::stride, ::stride]), 0, 65535).astype(np.uint16)
+        log("world/camera/depth/image", rr.DepthImage(z_mm, meter=1000.0))
 
     def _pose(self, spline: Spline, frame: Frame) -> None:
         shutter, camera = self.rig.depth_shutter, self.rig.depth_camera
@@ -190,10 +190,6 @@ def jpeg(rgb: ByteArray, width: int) -> bytes:
         height = round(rgb.shape[0] * width / rgb.shape[1])
         rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     return bytes(cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
-
-
-def _millimetres(z: FloatArray) -> Any:
-    return np.clip(np.rint(1e3 * z), 0, 65535).astype(np.uint16)
 
 
 def _diverging(x: FloatArray) -> ByteArray:

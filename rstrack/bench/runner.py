@@ -201,11 +201,6 @@ def code_digest(measure: str) -> str:
     return digest.hexdigest()
 
 
-def sequence_digest(root: Path) -> str:
-    """Of what describes a sequence: its lists, cameras and truth, not its images."""
-    return ",".join(f"{name} {_file_digest(root / name)}" for name in _DESCRIPTIONS if (root / name).is_file())
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -250,7 +245,10 @@ def _made_of(job: Job, root: Path | None) -> str:
         except UserError:
             return ""
     folder = root or job.sources.found(entry, name)
-    return "" if folder is None else sequence_digest(folder)
+    if folder is None:
+        return ""
+    described = [name for name in _DESCRIPTIONS if (folder / name).is_file()]
+    return ",".join(f"{name} {_file_digest(folder / name)}" for name in described)
 
 
 def _file_digest(path: Path) -> str | None:

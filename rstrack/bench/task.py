@@ -54,8 +54,9 @@ class Sources:
 
     @property
     def home(self) -> Path:
-        """Where rendered sequences are kept."""
-        return (self.cache or default_cache()) / "sequences"
+        """Where rendered sequences are kept: several gigabytes."""
+        default = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rolling-shutter-rgbd"
+        return (self.cache or default) / "sequences"
 
     def folder(self, entry: SequenceEntry, name: str, progress: Progress = no_progress) -> Path:
         """The folder of a sequence, rendered now if it is not there whole. Raises UserError, and Absent."""
@@ -115,11 +116,6 @@ class Sources:
         if not (self.data / path).exists():
             raise Absent(f"{self.data / path}: is not there")
         return (self.data / path).resolve()
-
-
-def default_cache() -> Path:
-    """Where sequences are kept that are rendered for benchmarks: several gigabytes."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rolling-shutter-rgbd"
 
 
 def run_rsgen(words: Sequence[str]) -> None:

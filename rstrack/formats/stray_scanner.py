@@ -59,7 +59,9 @@ def read(path: Path, options: ReadOptions) -> Recording:
         raise UserError(f"{path / 'odometry.csv'}: lists no frame")
     each = [[row[name] for name in _INTRINSICS] for row in rows] if "fx" in rows[0] else [_matrix(path)]
     first = _depth_file(path, rows[0])
-    color = median_camera(str(path), _video_size(path / "rgb.mp4"), each)
+    with _Video(path / "rgb.mp4") as video:
+        size = int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    color = median_camera(str(path), size, each)
     depth = resized(str(path), color, header_size(str(first), read_bytes(first)))
     imu = _table(path / "imu.csv", _IMU) if (path / "imu.csv").is_file() else []
     return Recording(
@@ -114,11 +116,6 @@ def _matrix(path: Path) -> list[float]:
     except ValueError:
         raise UserError(f"{file}: expected the nine numbers of a camera matrix") from None
     return [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-
-
-def _video_size(path: Path) -> tuple[int, int]:
-    with _Video(path) as video:
-        return int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
 
 
 class _Video:

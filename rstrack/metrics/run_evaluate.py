@@ -61,11 +61,7 @@ class RunEvaluation:
     @property
     def chosen(self) -> Metrics:
         """The errors that were asked for."""
-        return self.mounted or self._on_the_clock
-
-    @property
-    def _on_the_clock(self) -> Metrics:
-        return self.moved if self.asked and self.moved is not None else self.metrics
+        return self.mounted or (self.moved if self.asked and self.moved is not None else self.metrics)
 
     @property
     def truth_offset(self) -> dict[str, Any] | None:

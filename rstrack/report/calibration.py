@@ -106,7 +106,7 @@ def _values(record: CalibrationRecord) -> tuple[Block, ...]:
     rows = tuple(_row(p) for p in record.parameters.values())
     notes = (Note(f"{text[0].upper()}{text[1:]}.") for text in record.notes)
     lenses = (Note(f"{name.capitalize()} lens: {text}.") for name, text in record.lenses_px.items())
-    pictures = (Plot(chart) for chart in lens_charts(record))
+    pictures = (Plot(_lens_chart(name, lens)) for name, lens in record.lens_maps.items() if lens.at_px)
     table = Table(head, rows, "Found, and where it began")
     return table, Note(_SIGMA), *lenses, *notes, Plot(change_chart(record)), *pictures
 
@@ -164,12 +164,8 @@ def _camera_file(record: CalibrationRecord) -> tuple[Block, ...]:
         "rstrack track RECORDING --camera camera.yaml --out RUN tracks with it.")  # fmt: skip
 
 
-def lens_charts(record: CalibrationRecord) -> tuple[PageChart, ...]:
-    """Where each lens that was looked for puts points, against what it began with."""
-    return tuple(_lens_chart(name, lens) for name, lens in record.lens_maps.items() if lens.at_px)
-
-
 def _lens_chart(name: str, lens: LensMap) -> PageChart:
+    """Where a lens that was looked for puts points, against what it began with."""
     at, moved = np.array(lens.at_px), np.array(lens.moved_px)
     longest = float(np.linalg.norm(moved, axis=1).max())
     spacing = float(np.diff(np.unique(at[:, 0])).min(initial=np.inf))

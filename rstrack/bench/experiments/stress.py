@@ -203,7 +203,7 @@ class StressResult:
     @property
     def panels(self) -> Path | None:
         """Folder of the pictures of one keyframe, relative to the test's."""
-        return None if self.pictured is None else Path("cells", self.pictured.record.cell, "panels")
+        return None if self.pictured is None else self.pictured.record.folder / "panels"
 
     def fused(self, poses: str) -> list[StressCell]:
         """The cells that have keyframes fused along a path."""
