@@ -23,7 +23,7 @@ from rsgen.geometry import se3
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.options import CLOUD_PEERS, Options
-from rstrack.peers.peer import run_info, timed_frames
+from rstrack.peers.peer import readout_s, run_info, timed_frames
 
 # Pixels of a depth image are thinned out to about so many.
 _POINTS = 40_000
@@ -118,7 +118,7 @@ def run_cloud_peer(
     begin = time.perf_counter()
     seconds = timed_frames(name, chosen, cloud_of(dataset), feed, progress)
     stamps = dataset.stamps[chosen]
-    T_world_depth = se3.interpolated(stamps + _last_line(dataset), np.array(poses), stamps)
+    T_world_depth = se3.interpolated(stamps + readout_s(dataset, 1.0), np.array(poses), stamps)
     info = run_info(name, {_PACKAGES[name]: version(_PACKAGES[name])}, "on the CPU", dataset, chosen, begin, seconds)
     info |= {"settings": tracker.settings, "keyframes": 0, "lost": 0}
     return Estimate(stamps, se3.orthonormalise(T_world_depth), info=info)
@@ -131,7 +131,7 @@ def cloud_of(dataset: Dataset) -> Callable[[int], tuple[FloatArray, FloatArray]]
     stride = max(1, round(np.sqrt(camera.width * camera.height / _POINTS)))
     uv = camera.pixel_grid()[::stride, ::stride].reshape(-1, 2)
     rays = camera.unproject(uv)
-    before_s = _last_line(dataset) - shutter.line_mid_time(0.0, shutter.line_of_pixel(uv, camera), camera)
+    before_s = readout_s(dataset, 1.0) - shutter.line_mid_time(0.0, shutter.line_of_pixel(uv, camera), camera)
     line = np.maximum(0.0, 1.0 - before_s / float(np.median(np.diff(dataset.stamps))))
     longest = Options().max_depth
 
@@ -156,9 +156,3 @@ def _module(name: str, package: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise UserError(f"the peer needs {package} ({error}): {how_to_install('peers', package=package)}") from None
-
-
-def _last_line(dataset: Dataset) -> float:
-    """Seconds from a depth frame's stamp to the middle of its last line's exposure."""
-    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    return float(shutter.line_mid_time(0.0, shutter.line_count(camera) - 1.0, camera))

@@ -94,10 +94,10 @@ def timed_frames(
     return seconds
 
 
-def mid_readout_s(dataset: Dataset) -> float:
-    """Seconds from a depth frame's stamp to the middle of its readout."""
+def readout_s(dataset: Dataset, part: float) -> float:
+    """Seconds from a depth frame's stamp to the middle exposure of its last line (part 1), or a part of the way."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    return float(shutter.line_mid_time(0.0, 0.5 * (shutter.line_count(camera) - 1), camera))
+    return float(shutter.line_mid_time(0.0, part * (shutter.line_count(camera) - 1), camera))
 
 
 def run_info(
