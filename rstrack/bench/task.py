@@ -34,6 +34,12 @@ from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
 
 Render = Callable[[Sequence[str]], None]
+Measure = Callable[["Task", Progress], Figures]
+MEASURES: dict[str, str] = {
+    "track": "rstrack.bench.measures.track:track_cell",
+    "blur": "rstrack.bench.measures.blur:blur_cell",
+    "speed": "rstrack.bench.measures.speed:speed_cell",
+}
 
 
 class Absent(UserError):
@@ -140,14 +146,6 @@ def _can_be_read(folder: Path) -> bool:
     except UserError:
         return False
     return True
-
-
-Measure = Callable[["Task", Progress], Figures]
-MEASURES: dict[str, str] = {
-    "track": "rstrack.bench.measures.track:track_cell",
-    "blur": "rstrack.bench.measures.blur:blur_cell",
-    "speed": "rstrack.bench.measures.speed:speed_cell",
-}
 
 
 @dataclass(frozen=True)

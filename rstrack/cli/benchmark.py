@@ -23,6 +23,8 @@ BENCH_STATUS = (
     "exit status: 0 done, 1 a track was lost or failed, 2 wrong input, 130 interrupted (the same command resumes)"
 )
 
+SCORE_STATUS = "exit status: 0 done, 1 something is lost, missing or failed, 2 wrong input, 130 interrupted"
+
 
 def _added(text: str) -> tuple[str, Path]:
     name, folder = _named(text)
@@ -179,9 +181,6 @@ def _stress(
     tracker = Options(**asdict(tracker) | ({"method": methods[0]} if methods else {}))
     options = StressOptions(frames=None if frames is None else frames.stop, width=narrowed.width, tracker=tracker)
     return StressExperiment(config, replace(options, exposures_s=narrowed.exposure) if narrowed.exposure else options)
-
-
-SCORE_STATUS = "exit status: 0 done, 1 something is lost, missing or failed, 2 wrong input, 130 interrupted"
 
 
 def score(

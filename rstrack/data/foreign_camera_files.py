@@ -57,6 +57,19 @@ _EXTRINSIC = ("t_color_depth", "t_rgb_depth", "extrinsics", "extrinsic")
 Values = dict[str, Any]
 Size = tuple[int, int]
 
+# Our lens models by Kalibr's camera and distortion model; its cameras by the names of their topics.
+_MODELS: dict[tuple[str, str], Model] = {
+    ("pinhole", "none"): "pinhole",
+    ("pinhole", "radtan"): "radtan",
+    ("pinhole", "equidistant"): "fisheye",
+    ("ds", "none"): "double_sphere",
+}
+_KNOWN = "pinhole with radtan, equidistant or none, and ds with none"
+_DEPTH, _COLOR = re.compile(r"depth|infra|(^|/)ir(/|$)"), re.compile(r"colou?r|rgb")
+
+Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Pixels = Annotated[int, Field(ge=1, le=16384)]
+
 
 class _Loader(yaml.SafeLoader):
     """YAML with matrices."""
@@ -201,17 +214,8 @@ def _number(value: Any) -> float:
     return numbers[0] if len(numbers) == 1 else math.nan
 
 
-_MODELS: dict[tuple[str, str], Model] = {
-    ("pinhole", "none"): "pinhole",
-    ("pinhole", "radtan"): "radtan",
-    ("pinhole", "equidistant"): "fisheye",
-    ("ds", "none"): "double_sphere",
-}
-_KNOWN = "pinhole with radtan, equidistant or none, and ds with none"
-_DEPTH, _COLOR = re.compile(r"depth|infra|(^|/)ir(/|$)"), re.compile(r"colou?r|rgb")
-
-Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
-Pixels = Annotated[int, Field(ge=1, le=16384)]
+# ---------------------------------------------------------------------------------------------------------------------
+# of Kalibr
 
 
 class _Cam(BaseModel):

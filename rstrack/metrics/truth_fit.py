@@ -34,6 +34,7 @@ from rstrack.metrics.evaluate import motions, pairs_one_second_apart, pose_error
 
 TruthOffset = float | Literal["auto"]
 """Seconds after a stamp that the truth is looked up, or 'auto': those at which the errors are least."""
+TruthExtrinsics = Literal["auto"]
 Criterion = Literal["rotational drift", "translational drift"]
 CRITERIA: tuple[Criterion, ...] = ("rotational drift", "translational drift")
 
@@ -46,6 +47,12 @@ LEAST_PAIRS = 30
 
 # Resampled curves, and the length of what is resampled as one piece: errors of overlapping seconds are alike.
 _RESAMPLES, _BLOCK_S = 200, 2.0
+# Motions of one second must turn the camera this much, degrees RMS, about every axis that the fit needs.
+_LEAST_TURN_DEG = 2.0
+# Of that fit, each with new scales of the residuals.
+_ROUNDS = 4
+# Scales of residuals that do not differ from zero, m and rad.
+_EXACT = 1e-9
 
 
 @dataclass(frozen=True)
@@ -197,15 +204,6 @@ def _brent(cost: Callable[[float], float], grid: FloatArray, k: int) -> float:
     """Where a function is least between the neighbours of the k-th of some points."""
     found = minimize_scalar(cost, bounds=(grid[k - 1], grid[k + 1]), method="bounded", options={"xatol": 1e-6})
     return float(found.x)
-
-
-TruthExtrinsics = Literal["auto"]
-
-# Motions of one second must turn the camera this much, degrees RMS, about every axis that the fit needs.
-_LEAST_TURN_DEG = 2.0
-_ROUNDS = 4
-# Scales of residuals that do not differ from zero, m and rad.
-_EXACT = 1e-9
 
 
 @dataclass(frozen=True)

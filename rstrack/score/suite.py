@@ -33,6 +33,11 @@ from rstrack.data.estimate import INFO, TRAJECTORY, Estimate, read_info
 SUITE = "suite.yaml"
 # Any of them makes a folder a sequence.
 _SEQUENCE_FILES = ("sequence.yaml", "associations.txt", "rgb.txt", "depth.txt")
+_PEERS = "peers"
+METHOD = "method.yaml"
+# Rows of a SQUARE file whose poses have a Gaussian: stamp, pose, and the lower triangle of the 6x6 covariance.
+_COLUMNS = 1 + 7 + 21
+_CONVENTIONS = {"TANGENT_CONVENTION": "right_perturbation", "TANGENT_ORDER": "translation_rotation"}
 
 
 class SuiteEntry(BaseModel):
@@ -103,9 +108,6 @@ def _matches(entry: SuiteEntry, patterns: tuple[str, ...]) -> bool:
     return any(fnmatchcase(word, pattern) for word in words for pattern in patterns)
 
 
-_PEERS = "peers"
-
-
 def run_methods(
     suite: Suite, methods: Sequence[str], out: Path, scheduler: str | None = None, progress: Progress = no_progress
 ) -> Outcome:
@@ -126,12 +128,6 @@ def run_methods(
     sources = Sources(data=suite.root.resolve(), scheduler=scheduler)
     with open_workers(scheduler) as workers:
         return run_cells(Benchmark(cells), out, sources, workers, progress)
-
-
-METHOD = "method.yaml"
-# Rows of a SQUARE file whose poses have a Gaussian: stamp, pose, and the lower triangle of the 6x6 covariance.
-_COLUMNS = 1 + 7 + 21
-_CONVENTIONS = {"TANGENT_CONVENTION": "right_perturbation", "TANGENT_ORDER": "translation_rotation"}
 
 
 class About(StrictModel):

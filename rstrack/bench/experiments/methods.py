@@ -47,6 +47,10 @@ from rstrack.options import METHODS, PEERS, Options
 MAPPED = ("rs-pg", "gs-pg", "baseline")
 """The methods whose maps are compared: ours, the same without its model of the shutter, and the classical way."""
 _FUSE, _NO_FUSE = "-fuse", "-no-fuse"
+RESULTS = "results.json"
+AVERAGE = "average"
+"""The case that averages are records of."""
+BASELINE = "baseline"
 
 
 class Quick(StrictModel):
@@ -235,12 +239,6 @@ def row_of(name: str) -> str:
 
 def _is_rolling(name: str) -> bool:
     return name.startswith("rs-")
-
-
-RESULTS = "results.json"
-AVERAGE = "average"
-"""The case that averages are records of."""
-BASELINE = "baseline"
 
 
 class Results(BaseModel, frozen=True):

@@ -46,6 +46,9 @@ from rstrack.options import METHODS, Options
 
 Seconds = Annotated[float, Field(ge=0.0, le=1.0)]
 STREAMS = ("color", "depth")
+CONFIDENCE = 0.95
+_Methods = dict[str, dict[float, CellRecord]]
+_DASHED = "Dashed: the shutter is taken for a global one, or for a lidar's sweep."
 
 
 class MotionEntry(StrictModel):
@@ -169,11 +172,6 @@ def shutter_fields(path: Path, readout_s: float, exposure_s: float) -> dict[str,
         fields |= {f"{stream}.readout_s": readout_s, f"{stream}.exposure_s": exposure_s}
         fields[f"{stream}.offset_s"] = round(offset + 0.5 * exposure_s, 9)
     return fields
-
-
-CONFIDENCE = 0.95
-_Methods = dict[str, dict[float, CellRecord]]
-_DASHED = "Dashed: the shutter is taken for a global one, or for a lidar's sweep."
 
 
 @dataclass(frozen=True)

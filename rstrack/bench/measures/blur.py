@@ -38,6 +38,7 @@ PANELS = ("registered", "weights", "constant", "blur_aware", "sharp_view")
 # Seconds within which a keyframe and the sharp truth are of the same instant.
 _SAME_INSTANT_S = 1e-4
 _TRUTH = "global_middle"
+_WINDOW = 11
 
 
 def blur_cell(task: Task, progress: Progress) -> Figures:
@@ -170,9 +171,6 @@ def _write_panels(keyframes: Sequence[FusedKeyframe], truth: Dataset, sigma: flo
     height, width = weights.shape
     about = Panels(keyframe=best.index, width=width, height=height, white=white)
     atomic_write(folder / "panels.json", (about.model_dump_json(indent=1) + "\n").encode())
-
-
-_WINDOW = 11
 
 
 def psnr_db(image: ByteArray, truth: ByteArray, known: BoolArray) -> float:
