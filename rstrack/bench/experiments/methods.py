@@ -271,7 +271,7 @@ class Results(BaseModel, frozen=True):
         return [sequence.name for sequence in self.sequences if sequence.group == group]
 
     def shown(self, group: str) -> dict[str, str]:
-        """What the tables of a group show: a variant for each of their lines (`variants.row_of`).
+        """What the tables of a group show: a variant for each of their lines (`row_of`).
 
         Of two settings, that which keeps the track on more sequences, and then that of the smaller mean ATE over those
         where both do: one setting for the whole group and all errors, not the luckier one of every cell.
