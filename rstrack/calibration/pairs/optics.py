@@ -15,7 +15,6 @@ from rsgen.device.lens import Lens, TracedCamera, camera_numbers
 from rsgen.device.projection import Projection, Vector
 from rsgen.geometry.camera import Camera
 from rstrack.calibration.parameters import DEPTH, LENS, NAMES
-from rstrack.data.rig import DepthError
 
 # Coefficients of distortion at most.
 _BENDS = 8
@@ -50,7 +49,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Optics:
-    """On the device: normalised coordinates of depth's pixels, `camera_table` of both, `error_table`."""
+    """On the device: normalised coordinates of depth's pixels, `camera_table` of both, error (3,): see DEPTH."""
 
     rays_x: Any
     rays_y: Any
@@ -74,7 +73,7 @@ def traced(e: Engine, lens: Lens, table: Any) -> Lens:
 
 
 def without_error(e: Engine, asked: Asked, z: Any, xn: Any, yn: Any, table: Any) -> Any:
-    """Depth on the device, along rays (xn, yn), as `DepthError.corrected` has it."""
+    """Depth on the device, along rays (xn, yn), as `DepthError.corrected` has it; table: `Optics.error`."""
     if not asked.corrects:
         return z
     offset, inverse_offset, radial = (dr.gather(e.Float, table, e.UInt(i)) for i in range(len(DEPTH)))
@@ -143,8 +142,3 @@ def units(names: Sequence[str], median_depth: float) -> FloatArray:
     """Units (n,) of the columns of such unknowns: what they then come to is like that of a twist."""
     power = np.array([1.0 if name in LENS else 2.0 * (name != DEPTH[0]) for name in names])
     return np.array([_SHOWN * _MOVES[name] for name in names]) * median_depth**power
-
-
-def error_table(error: DepthError) -> FloatArray:
-    """What `without_error` takes (3,)."""
-    return np.array([error.offset_m, error.inverse_offset, error.radial])

@@ -24,7 +24,7 @@ from rstrack.calibration.pairs.kernels import (
     color_pair_kernel,
     depth_pair_kernel,
 )
-from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, units
+from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, units
 from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError
@@ -55,9 +55,9 @@ class PairTerms:
         """Rays of the pixels that are compared, cameras and depth's error, on the device."""
         now = *self.cameras(p), p.error
         if self._optics is None or self._optics[0] != now:
-            e, (depth, color, error) = self.e, now
+            e, (depth, color, _) = self.e, now
             rays = np.nan_to_num(depth.unproject(depth.pixel_grid()[:: self.stride, :: self.stride])[..., :2])
-            tables = camera_table(depth), camera_table(color), error_table(error)
+            tables = camera_table(depth), camera_table(color), p.depth_error
             found = Optics(*(e.upload(given) for given in (rays[..., 0], rays[..., 1], *tables)))
             self._optics = now, found
         return self._optics[1]
