@@ -14,9 +14,8 @@ from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.device.arrays import Engine, Kernels, aligned
 from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import Scaling, block_counts, sizes
+from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts, sizes
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
-from rstrack.calibration.pairs.chain import PairSums, pair_sums
 from rstrack.calibration.pairs.images import LinePoses, WindowImages, pair_lens
 from rstrack.calibration.pairs.kernels import (
     ColorPairInput,
@@ -35,6 +34,24 @@ _SMOOTH = 0.25
 _POINTS = 4800
 # Pixels that may fall into a block of lines, over its share.
 _CROWDED = 4
+
+
+@dataclass(frozen=True)
+class PairSums:
+    """Sums of p pairs of images, of those u pairs of their blocks that have pixels.
+
+    blocks: see `BlockSums`, the pairs of blocks as current ones. begin (p + 1,): where a pair of images begins among
+    these. current, reference (u,): numbers of the blocks among those of all images. coupling (u, 6, n), own_H (p, n, n)
+    and own_g (p, n): further columns', see `ColumnSums`, the latter two of each pair, or (1, ...) of all together.
+    """
+
+    blocks: BlockSums
+    begin: IntArray
+    current: IntArray
+    reference: IntArray
+    coupling: FloatArray
+    own_H: FloatArray
+    own_g: FloatArray
 
 
 @dataclass
@@ -141,7 +158,7 @@ class PairTerms:
         def found() -> PairSums:
             whole = np.concatenate([one.numpy()[: each * size] for one in raw])[: len(pairs) * size]
             apart = what[0] is color_pair_kernel
-            return pair_sums(whole, scaling, pairs, block_counts(lens, lens)[0], unit, apart)
+            return _pair_sums(whole, scaling, pairs, block_counts(lens, lens)[0], unit, apart)
 
         return found
 
@@ -170,3 +187,25 @@ def _asked(dataset: Dataset, free: BoolArray) -> Asked:
     depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
     depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
     return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NO_DEPTH_ERROR, one)
+
+
+def _pair_sums(
+    raw: IntArray, scaling: Scaling, pairs: IntArray, count: int, unit: FloatArray, apart: bool
+) -> PairSums:  # fmt: skip
+    """Integers (p, ...) as summed on the device, of pairs (p, 2) of images, current and reference, with `count` blocks.
+
+    unit (n,): what 1 of the further columns stands for. apart: some of these belong to one pair alone.
+    """
+    p, n = len(pairs), len(unit)
+    rows = raw.reshape(p * count**2, -1)
+    used = np.flatnonzero(rows.any(axis=1))
+    pair, of = used // count**2, used % count**2
+    blocks = scaling.unpack(rows[used], len(used), 1, n)
+    coupling = np.zeros((len(used), 6, 0)) if blocks.columns is None else blocks.columns.coupling[:, 0] * unit
+    totals = rows.reshape(p if apart else 1, -1, rows.shape[1]).sum(axis=1)
+    own = [each for total in totals if (each := scaling.unpack(total, 1, 1, n).columns) is not None]
+    own_H = np.array([each.H for each in own]).reshape(len(totals), n, n) * np.outer(unit, unit)
+    own_g = np.array([each.g for each in own]).reshape(len(totals), n) * unit
+    begin = np.searchsorted(pair, np.arange(p + 1))
+    current, reference = pairs[pair, 0] * count + of // count, pairs[pair, 1] * count + of % count
+    return PairSums(blocks, begin, current, reference, coupling, own_H, own_g)

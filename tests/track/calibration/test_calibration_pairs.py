@@ -15,10 +15,9 @@ from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.normal_equations import eliminate
 from rstrack.alignment.weights import START_INTENSITY
 from rstrack.calibration.pairs import kernels
-from rstrack.calibration.pairs.chain import PairSums, add_system, without_brightness
 from rstrack.calibration.pairs.images import ACROSS, LinePoses, lines_of
-from rstrack.calibration.pairs.terms import PairTerms, pair_terms
-from rstrack.calibration.pairs.window import partners
+from rstrack.calibration.pairs.terms import PairSums, PairTerms, pair_terms
+from rstrack.calibration.pairs.window import add_system, partners, without_brightness
 from rstrack.calibration.parameters import COUNT, NAMES
 from rstrack.calibration.run import parameters_of
 from rstrack.calibration.start import load_window
