@@ -23,9 +23,9 @@ from rstrack.bench.definitions import SequenceEntry, StrictModel
 from rstrack.bench.measures.track import track_cell
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
-from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.figures import displacement_px, rms
 from rstrack.calibration.parameters import COLOR_LENS, DRIFT, EXTRINSICS, NAMES, POSES, Parameters
+from rstrack.calibration.record import camera_file_of
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.data.dataset import Dataset, open_dataset

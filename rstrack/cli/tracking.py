@@ -58,9 +58,8 @@ def track(
     """
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.camera_file import camera_file_of
     from rstrack.calibration.devices import device_named
-    from rstrack.calibration.record import CALIBRATION, write_record
+    from rstrack.calibration.record import CALIBRATION, camera_file_of, write_record
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.data.dataset import open_dataset
     from rstrack.data.rig import UNDISTORTED_K1
@@ -163,9 +162,8 @@ def calibrate(
     """Find a recording's cameras from its images alone: lenses, readouts, clocks, extrinsics, with standard errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.camera_file import camera_file_of
     from rstrack.calibration.devices import device_named
-    from rstrack.calibration.record import content_of, record_of
+    from rstrack.calibration.record import camera_file_of, content_of, record_of
     from rstrack.calibration.run import calibrate as calibrate_cameras
     from rstrack.calibration.several import check_alike, together
     from rstrack.data.dataset import open_dataset
