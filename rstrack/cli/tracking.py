@@ -224,7 +224,7 @@ def _imu(
 ) -> int:  # fmt: skip
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.imu.run import calibrate_imu, track_of, track_of_run
+    from rstrack.calibration.imu import calibrate_imu, track_of, track_of_run
 
     if dataset.imu_files is not None:
         dataset.imu_files.description()  # complain before minutes of tracking

@@ -14,12 +14,13 @@ from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.geometry import so3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
+from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.estimate import GRAVITY, SIZE, TURN, ImuEstimate
 from rstrack.inertial.factor import ImuFactor, motion
 
-SATURATED = 0.995
-"""Part of a sensor's range from which on a reading is saturated, or may be."""
+# Part of a sensor's range from which on a reading is saturated, or may be.
+_SATURATED = 0.995
 # An outlier stands out from between its neighbours by so many σ of the noise, and so many times as far as the four
 # around it differ: motion that sudden would show in these, too. A bus that drops a bit leaves such readings.
 _SIGMAS, _TIMES = 20.0, 3.0
@@ -38,10 +39,9 @@ class ImuReadings:
         """All of a recording; saturated readings, outliers, and those that are not numbers do not count."""
         gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
         values = np.concatenate([gyro, imu.accel], axis=1)
-        limits = [np.inf if r is None else SATURATED * r for r in (imu.noise.gyro_range, imu.noise.accel_range)]
         parts = zip((gyro, imu.accel), reading_sigmas(imu), strict=True)
         with np.errstate(invalid="ignore"):
-            counts = np.isfinite(values) & (np.abs(values) < np.repeat(limits, 3))
+            counts = np.isfinite(values) & within_range(values, imu.noise)
             counts &= ~np.concatenate([outliers(part, sigma) for part, sigma in parts], axis=1)
         return cls(np.asarray(imu.t, dtype=np.float64), np.where(counts, values, 0.0), counts.astype(np.float64))
 
@@ -159,6 +159,12 @@ class ImuResiduals:
                 total[to, tail] += squares[own, 24:]
                 total[to, low : low + 24] += squares[own, :24]
         return ImuQuadratic(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), scatter
+
+
+def within_range(values: FloatArray, noise: ImuNoise) -> BoolArray:
+    """Which readings (n, 6) = [gyro; accel] are not saturated."""
+    limits = [np.inf if limit is None else _SATURATED * limit for limit in (noise.gyro_range, noise.accel_range)]
+    return np.asarray(np.abs(values) < np.repeat(limits, 3))
 
 
 def outliers(values: FloatArray, sigma: float) -> BoolArray:

@@ -16,7 +16,8 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu, imu_csv, simulate_imu
-from rstrack.calibration.imu.model import (
+from rstrack.calibration.imu import ImuCalibration, begin, calibrate_imu
+from rstrack.calibration.imu_model import (
     DRIFT,
     LEVER,
     OFFSET,
@@ -27,9 +28,7 @@ from rstrack.calibration.imu.model import (
     ImuUnknowns,
     hats,
 )
-from rstrack.calibration.imu.result import ImuCalibration
-from rstrack.calibration.imu.run import begin, calibrate_imu
-from rstrack.calibration.imu.solve import _alike
+from rstrack.calibration.imu_solve import _alike
 from rstrack.calibration.start import TrackedSpline
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset
