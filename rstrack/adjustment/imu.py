@@ -18,10 +18,9 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.band import MotionBand
 from rstrack.inertial.estimate import STRENGTH, ImuEstimate, bias_walk
 from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.residuals import ImuReadings, guessed_gravity, reading_sigmas
+from rstrack.inertial.readings import ImuReadings, MotionBand, guessed_gravity, reading_sigmas
 
 # About how far apart the biases' knots are, s.
 _KNOT_S = 1.0

@@ -16,7 +16,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
 from rstrack.inertial.estimate import GRAVITY, SIZE, STRENGTH, ImuEstimate
-from rstrack.inertial.residuals import ImuQuadratic, without_tail
+from rstrack.inertial.factor import ImuQuadratic, without_tail
 
 # Information of a control point that nothing observes (σ 100 m, rad): systems are never singular.
 _NOTHING = 1e-4
