@@ -20,7 +20,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.estimate import STRENGTH, ImuEstimate, bias_walk
 from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.readings import ImuReadings, MotionBand, guessed_gravity, reading_sigmas
+from rstrack.inertial.readings import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 
 # About how far apart the biases' knots are, s.
 _KNOT_S = 1.0
@@ -185,8 +185,7 @@ class ImuTerm:
         for r, *_ in self._rows(spline, state):
             squares += ((r * np.repeat(self.sigma, 3)) ** 2).reshape(-1, 2, 3).sum(axis=(0, 2))
         number = self.samples.counts.reshape(-1, 2, 3).sum(axis=(0, 2))
-        followed = min(1.0, 1.0 / (self.recording.rate_hz * spline.dt)) * self.noise**2
-        sigma = np.sqrt(squares / np.maximum(1.0, number) + followed)
+        sigma = np.sqrt(variance_about(spline.dt, self.recording, squares, number))
         return replace(self, sigma=np.where(number > 0.0, np.maximum(self.noise, sigma), self.sigma))
 
     def _rows(self, spline: Spline, state: ImuState) -> Iterator[tuple[FloatArray, FloatArray, IntArray, IntArray]]:

@@ -187,22 +187,25 @@ class ImuQuadratic:
     def without_imu(self, estimate: ImuEstimate, at: FloatArray) -> tuple[Quadratic, float, FloatArray]:
         """Over the control points alone, the IMU's numbers, here around `at` (12,), being best at every step and known
         beforehand as `estimate` says; the cost, and the best ones (12,) where no control point moves."""
-        off = at - estimate.mean
-        gradient = self.g[6 * self.count :] + estimate.information @ off
-        model, step = without_tail(self.first, self.H, self.g, estimate.information, gradient)
-        cost = self.cost + 0.5 * float(off @ estimate.information @ off) - 0.5 * float(gradient @ step)
-        return model, cost, at - step
+        off, points = at - estimate.mean, 6 * self.count
+        more = estimate.information, estimate.information @ off
+        H, g, step, gained = without(self.H, self.g, slice(points, None), slice(points), more)
+        cost = self.cost + 0.5 * float(off @ estimate.information @ off) - gained
+        return Quadratic(self.first, H, g), cost, at - step
 
 
-def without_tail(
-    first: int, H: FloatArray, g: FloatArray, information: FloatArray, gradient: FloatArray
-) -> tuple[Quadratic, FloatArray]:  # fmt: skip
-    """H, g without the IMU's numbers, the last ones, of which there is more information (12, 12); and what these are
-    smaller by where they are best (12,). gradient (12,): by them, of all together."""
-    z, c = slice(len(g) - SIZE, None), slice(0, len(g) - SIZE)
-    solved = np.linalg.solve(H[z, z] + information, np.column_stack([H[z, c], gradient]))
-    rest = H[c, c] - H[c, z] @ solved[:, :-1]
-    return Quadratic(first, 0.5 * (rest + rest.T), g[c] - H[c, z] @ solved[:, -1]), np.asarray(solved[:, -1])
+def without(
+    H: FloatArray, g: FloatArray, gone: slice, kept: slice, more: tuple[FloatArray, FloatArray] | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """½ xᵀ H x + gᵀ x of some numbers, the others (k) being best at every step: H and g.
+
+    Also what these are smaller by where they are best and no other moves (k,), and what that gains. more: H (k, k) and
+    g (k,) of what else is known of them.
+    """
+    own, gradient = (H[gone, gone], g[gone]) if more is None else (H[gone, gone] + more[0], g[gone] + more[1])
+    solved = np.linalg.solve(own, np.column_stack([H[gone, kept], gradient]))
+    rest, step = H[kept, kept] - H[kept, gone] @ solved[:, :-1], solved[:, -1]
+    return 0.5 * (rest + rest.T), g[kept] - H[kept, gone] @ step, step, 0.5 * float(gradient @ step)
 
 
 @dataclass(frozen=True)

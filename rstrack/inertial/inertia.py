@@ -15,7 +15,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.inertial.estimate import GRAVITY, GYRO, SIZE, ImuEstimate, estimate_dict
 from rstrack.inertial.factor import ImuResiduals
-from rstrack.inertial.readings import ImuReadings, MotionBand, guessed_gravity, reading_sigmas
+from rstrack.inertial.readings import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².
@@ -289,12 +289,10 @@ class Inertia:
             self._sampled = np.full(2, _EXPECTED)
 
     def _learn_sigma(self, r: FloatArray, counts: FloatArray, dt: float) -> None:
-        # Of noise a spline follows a part; what it cannot follow is all in the residuals.
-        followed = min(1.0, 1.0 / (self.recording.rate_hz * dt)) * self._noise**2
         squares, number = (each.reshape(-1, 2, 3).sum(axis=(0, 2)) for each in (r**2 * counts, counts))
         self._sampled = np.minimum(self._sampled + number / 3.0, _MEMORY)
         weight = np.minimum(1.0, number / (3.0 * self._sampled))
-        seen = squares / np.maximum(1.0, number) + followed
+        seen = variance_about(dt, self.recording, squares, number)
         seen = np.minimum(seen, 25.0 * self.sigma**2)  # one blow must not blind it for long
         mean = np.where(number > 0.0, (1.0 - weight) * self.sigma**2 + weight * seen, self.sigma**2)
         self.sigma = np.maximum(self._noise, np.sqrt(mean))

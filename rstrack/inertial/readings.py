@@ -92,6 +92,15 @@ def reading_sigmas(recording: ImuRecording) -> FloatArray:
     return np.array([noise.gyro_density, noise.accel_density]) * root
 
 
+def variance_about(dt: float, recording: ImuRecording, squares: FloatArray, count: FloatArray) -> FloatArray:
+    """Of either sensor's readings (2,) about a spline with knots dt s apart, by sums of `count` (2,) squared residuals.
+
+    Of noise a spline follows a part; what it cannot follow is all in the residuals.
+    """
+    followed = min(1.0, 1.0 / (recording.rate_hz * dt)) * reading_sigmas(recording) ** 2
+    return squares / np.maximum(1.0, count) + followed
+
+
 def guessed_gravity(spline: Spline, readings: ImuReadings, recording: ImuRecording) -> FloatArray:
     """Gravity in the world (3,), m/s², if the mean force were nothing else."""
     R = spline.pose(readings.t)[:, :3, :3] @ recording.T_imu_depth[:3, :3].T
