@@ -207,7 +207,7 @@ def _beside(calibration: CameraCalibration) -> list[str]:
 
 def _stream(
     name: str, camera: Camera, shutter: Shutter, readout_s: float, scan: Scan, beside: Sequence[str]
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """beside: comments of LENS."""
     K = ", ".join(f"{x:.10g}" for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     bent = f"  distortion: [{', '.join(f'{x:.10g}' for x in camera.distortion)}]{_joined(beside[4:])}"

@@ -102,7 +102,7 @@ def pair_grid(e: Engine, depth: Lens, raster: Raster, pixels: PixelGrid, given: 
     current, reference = (dr.gather(e.UInt, given.pairs, 2 * pair + i) for i in range(2))
     return PairGrid(
         launched, pair, current, reference, row * columns + column, column * stride, row * stride, pixels.meant
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,7 @@ class Point:
     active: Any
 
 
-def _points(
-    e: Engine, depth: Lens, raster: Raster, pixels: PairGrid, view: Any, asked: Asked, given: Given
-) -> Point:  # fmt: skip
+def _points(e: Engine, depth: Lens, raster: Raster, pixels: PairGrid, view: Any, asked: Asked, given: Given) -> Point:
     """Of pixels of a view's depth image."""
     z = dr.gather(e.Float, given.depth, view * raster.count + pixels.number)
     xn, yn = (dr.gather(e.Float, rays, pixels.number) for rays in (given.rays_x, given.rays_y))
@@ -256,9 +254,7 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: 
     of_lens = depth, Raster.of(depth.camera, stride), Blocks.of(depth, depth), _runs(e, depth, stride, pairs)
 
     @recorded_with(e, DepthPairInput, *of_lens, PairSize(size))
-    def kernel(
-        given: DepthPairInput, depth: Lens, raster: Raster, blocks: Blocks, runs: Runs, pair: PairSize
-    ) -> Any:  # fmt: skip
+    def kernel(given: DepthPairInput, depth: Lens, raster: Raster, blocks: Blocks, runs: Runs, pair: PairSize) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:

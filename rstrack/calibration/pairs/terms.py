@@ -189,9 +189,7 @@ def _asked(dataset: Dataset, free: BoolArray) -> Asked:
     return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NO_DEPTH_ERROR, one)
 
 
-def _pair_sums(
-    raw: IntArray, scaling: Scaling, pairs: IntArray, count: int, unit: FloatArray, apart: bool
-) -> PairSums:  # fmt: skip
+def _pair_sums(raw: IntArray, scaling: Scaling, pairs: IntArray, count: int, unit: FloatArray, apart: bool) -> PairSums:
     """Integers (p, ...) as summed on the device, of pairs (p, 2) of images, current and reference, with `count` blocks.
 
     unit (n,): what 1 of the further columns stands for. apart: some of these belong to one pair alone.
