@@ -88,11 +88,6 @@ class Volume:
         return len(self._directory)
 
     @property
-    def blocks_away(self) -> int:
-        """How many of them are in the file only."""
-        return int(np.count_nonzero(self._directory.slots < 0))
-
-    @property
     def bytes(self) -> int:
         """Memory of the values and of the window."""
         return self._values.bytes + 8 * self._directory.table.size

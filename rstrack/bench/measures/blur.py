@@ -46,7 +46,7 @@ def blur_cell(task: Task, progress: Progress) -> Figures:
     figures = accuracy(task, estimate) | figures
     for poses, spline, covers in _paths(dataset, estimate):
         progress("fusing", 1.0, f"along the {poses} path")
-        keyframes = list(fused_keyframes(dataset, spline, (None, *sigmas), task.options, None, covers))
+        keyframes = list(fused_keyframes(dataset, spline, (None, *sigmas), task.options, covers))
         figures |= _color(keyframes, dataset, poses) | _depth(keyframes, dataset, task.options, poses)
         if poses == "true" and keyframes and sigmas:
             _write_panels(keyframes, dataset, min(sigmas, key=lambda s: abs(s - 1.0)), task.out / "panels")
