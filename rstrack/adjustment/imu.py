@@ -18,9 +18,9 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.band import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 from rstrack.inertial.estimate import STRENGTH, ImuEstimate, bias_walk
 from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.readings import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 
 # About how far apart the biases' knots are, s.
 _KNOT_S = 1.0
@@ -128,7 +128,7 @@ class ImuTerm:
         inside = ((samples.t[:, None] >= begin) & (samples.t[:, None] < end)).any(axis=1)
         if recording.gyro is None or not inside.any():
             return None
-        samples = ImuReadings(samples.t[inside], samples.values[inside], samples.counts[inside])
+        samples = samples[inside]
         band, noise = MotionBand.of(recording), reading_sigmas(recording)
         sigma = np.hypot(noise, band.scatter(spline.dt))
         per = max(1, round(_KNOT_S / spline.dt))
@@ -199,7 +199,7 @@ class ImuTerm:
                 end = int(np.searchsorted(segment, segment[begin + _AT_ONCE]))
                 end = end if end > begin else int(np.searchsorted(segment, segment[begin], side="right"))
             part = slice(begin, end)
-            samples = ImuReadings(self.samples.t[part], self.samples.values[part], self.samples.counts[part])
+            samples = self.samples[part]
             at = ImuFactor(motion(spline, samples.t), state.T_imu_depth, state.gravity)
             scale = 1.0 + state.scales
             knot, rest = np.divmod(segment[part] - self.segment, self.per)

@@ -25,7 +25,7 @@ from rstrack.calibration.start import TrackedSpline, tracked
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.imu.description import ImuDescription, ImuNoise, imu_yaml
-from rstrack.inertial.readings import reading_sigmas, within_range
+from rstrack.inertial.band import reading_sigmas, within_range
 from rstrack.options import Options
 
 # Seconds that must have been followed; at both ends nothing is taken, since the clock moves.

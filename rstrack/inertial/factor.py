@@ -23,8 +23,8 @@ from rsgen.geometry import se3, so3
 from rsgen.geometry.so3 import cross, hat, powers
 from rsgen.geometry.spline import BASES, Spline
 from rstrack.alignment.normal_equations import Quadratic
+from rstrack.inertial.band import ImuReadings
 from rstrack.inertial.estimate import GRAVITY, SIZE, TURN, ImuEstimate
-from rstrack.inertial.readings import ImuReadings
 
 
 @dataclass(frozen=True)
@@ -248,8 +248,7 @@ class ImuResiduals:
     def until(self, end: float) -> ImuResiduals:
         """Those of samples before a time, s."""
         n = int(np.searchsorted(self.samples.t, end))
-        samples = self.samples.between(-np.inf, end)
-        return ImuResiduals(samples, self.r[:n], self.J[:n], self.first[:n])
+        return ImuResiduals(self.samples[:n], self.r[:n], self.J[:n], self.first[:n])
 
     def moved(self, first: int, increments: FloatArray) -> ImuResiduals:
         """Where control points from number `first` on have moved by increments (k, 6)."""

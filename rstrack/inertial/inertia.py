@@ -13,9 +13,9 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.priors import ACCELERATION, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.band import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 from rstrack.inertial.estimate import GRAVITY, GYRO, SIZE, ImuEstimate, estimate_dict
 from rstrack.inertial.factor import ImuResiduals
-from rstrack.inertial.readings import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².

@@ -10,7 +10,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
-from rstrack.inertial.readings import with_knots
+from rstrack.inertial.band import with_knots
 from rstrack.options import Options
 
 if TYPE_CHECKING:

@@ -23,9 +23,9 @@ from rstrack.data.moving_masks import MovingMasks
 from rstrack.data.rig import Frame, Rig
 from rstrack.images.device_frame import DeviceFrame, DeviceRig, Timer, frame_without
 from rstrack.images.pyramid import DepthImage
+from rstrack.inertial.band import with_knots
 from rstrack.inertial.estimate import ALIKE
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.readings import with_knots
 from rstrack.keyframes.archive import Archive
 from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker

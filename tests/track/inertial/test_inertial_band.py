@@ -17,8 +17,8 @@ from rsgen.sensors.imu import simulate_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
+from rstrack.inertial.band import ImuReadings, MotionBand, missed, with_knots
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.readings import ImuReadings, MotionBand, missed, with_knots
 from rstrack.options import Options
 from rstrack.tracking.spline_tracker import Tracker
 

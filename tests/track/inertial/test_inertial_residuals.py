@@ -13,9 +13,9 @@ from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.band import ImuReadings
 from rstrack.inertial.estimate import SIZE, ImuEstimate
 from rstrack.inertial.factor import ImuFactor, ImuResiduals, motion
-from rstrack.inertial.readings import ImuReadings
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])
 GRAVITY = np.array([1.0, -9.0, 3.5])

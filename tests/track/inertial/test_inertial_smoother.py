@@ -17,11 +17,11 @@ from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.band import ImuReadings
 from rstrack.inertial.estimate import SIZE, TURN, TURNED, ImuEstimate, is_contradicted, text
 from rstrack.inertial.estimate import STRENGTH as STRENGTH_SIGMA
 from rstrack.inertial.factor import ImuResiduals
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.readings import ImuReadings
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 GRAVITY = np.array([2.0, -8.6, 4.262])

@@ -23,8 +23,8 @@ from rstrack.data.estimate import read_estimate
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Frame, Image, Rig
+from rstrack.inertial.band import MotionBand
 from rstrack.inertial.estimate import upright
-from rstrack.inertial.readings import MotionBand
 from rstrack.options import Options
 from rstrack.tracking.runs import checkpoint
 from rstrack.tracking.runs.run import track

@@ -1,4 +1,4 @@
-"""An IMU's readings: which of them count, and how dense knots have to be for the motion that their spectrum shows.
+"""An IMU's readings: which of them count, and how dense knots have to be for the band of the motion that they show.
 
 A uniform spline of degree n with knots Δt apart misses of a wave of f Hz, at best and in the mean over its phases, the
 part 1 − sinc²ⁿ⁺²(f Δt) / Σ_k sinc²ⁿ⁺²(f Δt + k) of its power (Blu and Unser, Quantitative Fourier Analysis of
@@ -61,8 +61,10 @@ class ImuReadings:
 
     def between(self, begin: float, end: float) -> ImuReadings:
         """Those of begin ≤ t < end."""
-        part = slice(*np.searchsorted(self.t, [begin, end]))
-        return ImuReadings(self.t[part], self.values[part], self.counts[part])
+        return self[slice(*np.searchsorted(self.t, [begin, end]))]
+
+    def __getitem__(self, which: slice | BoolArray) -> ImuReadings:
+        return ImuReadings(self.t[which], self.values[which], self.counts[which])
 
     def __len__(self) -> int:
         return len(self.t)
