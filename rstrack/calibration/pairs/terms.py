@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -24,7 +24,7 @@ from rstrack.calibration.pairs.kernels import (
     depth_pair_kernel,
 )
 from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, units
-from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
+from rstrack.calibration.parameters import COLOR_LENS, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError
 
@@ -54,19 +54,16 @@ class PairSums:
     own_g: FloatArray
 
 
-@dataclass
 class PairTerms:
-    """The kernels of one rig. depth, color: lenses of `pair_lens`; asked: what of them is unknown."""
+    """The kernels of a dataset's rig. depth, color: lenses of `pair_lens`; asked: what of them is unknown."""
 
-    e: Engine
-    depth: Lens
-    color: Lens
-    asked: Asked
-    _kernel: Kernels = field(init=False)
-    _optics: tuple[tuple[Camera, Camera, DepthError], Optics] | None = None
-
-    def __post_init__(self) -> None:
-        self._kernel = Kernels(self.e)
+    def __init__(self, e: Engine, dataset: Dataset, free: BoolArray) -> None:
+        """With columns for those lens and depth unknowns (31,) that are free."""
+        rig = dataset.rig
+        self.depth = pair_lens(rig.depth_camera, rig.depth_shutter)
+        self.color = pair_lens(rig.color_camera, rig.color_shutter)
+        self.e, self.asked, self._kernel = e, _asked(dataset, free), Kernels(e)
+        self._optics: tuple[tuple[Camera, Camera, DepthError], Optics] | None = None
 
     def optics(self, p: Parameters) -> Optics:
         """Rays of the pixels that are compared, cameras and depth's error, on the device."""
@@ -172,13 +169,6 @@ class PairTerms:
         pixels = -(-camera.width // self.stride) * -(-camera.height // self.stride)
         blocks = block_counts(lens, lens)[0]
         return Scaling(lever, bound, min(pixels, -(-_CROWDED * pixels // blocks)))
-
-
-def pair_terms(e: Engine, dataset: Dataset, free: BoolArray | None = None) -> PairTerms:
-    """The kernels of a dataset's rig, with columns for those lens and depth unknowns (31,) that are free."""
-    rig = dataset.rig
-    depth, color = pair_lens(rig.depth_camera, rig.depth_shutter), pair_lens(rig.color_camera, rig.color_shutter)
-    return PairTerms(e, depth, color, _asked(dataset, np.zeros(COUNT, bool) if free is None else free))
 
 
 def _asked(dataset: Dataset, free: BoolArray) -> Asked:
