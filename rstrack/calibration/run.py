@@ -26,16 +26,7 @@ from rstrack.calibration.figures import motion_of, pace_of, residuals_at, residu
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.trust import trust_in
 from rstrack.calibration.pairs.window import RecordingWindow
-from rstrack.calibration.parameters import (
-    COLOR_LENS,
-    DEPTH_LENS,
-    DRIFT,
-    GROUPS,
-    LENSES,
-    Known,
-    Parameters,
-    free_of,
-)
+from rstrack.calibration.parameters import COLOR_LENS, DEPTH_LENS, DRIFT, GROUPS, LENSES, Known, Parameters, free_of
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.solve import solve
 from rstrack.calibration.stages import StageResult, in_stages, progress_watch

@@ -24,14 +24,7 @@ from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rstrack.volume.blocks import BlockDirectory, BlockValues, unsigned
-from rstrack.volume.kernels import (
-    BLOCK,
-    POINTS,
-    integrate,
-    raycast_kernel,
-    scale_kernel,
-    visible_blocks_kernel,
-)
+from rstrack.volume.kernels import BLOCK, POINTS, integrate, raycast_kernel, scale_kernel, visible_blocks_kernel
 
 # Voxels to both sides of a surface within which distances are stored: at most the eight of a block.
 _TRUNCATION = 4.0

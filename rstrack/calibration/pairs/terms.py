@@ -17,12 +17,7 @@ from rsgen.geometry.camera import Camera
 from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts, sizes
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
 from rstrack.calibration.pairs.images import LinePoses, WindowImages, pair_lens
-from rstrack.calibration.pairs.kernels import (
-    ColorPairInput,
-    DepthPairInput,
-    color_pair_kernel,
-    depth_pair_kernel,
-)
+from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, color_pair_kernel, depth_pair_kernel
 from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, units
 from rstrack.calibration.parameters import COLOR_LENS, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
