@@ -28,46 +28,40 @@ from rstrack.images.sampling import PyramidLevel, Raster, cubic_value_and_slope,
 
 
 @dataclass(frozen=True)
-class DepthPairInput(GeometricInput):
-    """Device arrays of the depth kernel, see `GeometricInput`, for all pairs of a launch.
+class PairInput:
+    """Device arrays of both kernels, for all pairs of a launch.
 
-    depth, rays_*: of the pixels that are compared, of each view and of all. Surfaces are atlases. to_base, from_base:
-    of all views' lines. launch: the launch's first pair, and the last of all, which it repeats where there are no more.
-    pairs: current view and reference of each pair. own: of each pair the reference's 1 / median depth (1/m), and gain
-    and offset. camera: `camera_table`; error: as in `Optics`. constants: units of the unknowns too.
-    """
-
-    launch: Any
-    pairs: Any
-    own: Any
-    camera: Any
-    error: Any
-
-
-@dataclass(frozen=True)
-class ColorPairInput:
-    """Device arrays of the colour kernel, likewise.
-
-    depth: z of what the colour camera sees of each view's depth (m, 0: none); to_base: poses of depth's lines. image:
-    atlas of intensities, NaN where they are unusable; from_base: the colour camera's lines; camera: its `camera_table`.
-    own: gain and offset of the current image against the reference's last.
+    depth: z (m, 0: none) of the pixels that are compared, of each view; rays_* (normalised): of these; to_base: depth's
+    lines, of all views. camera: `camera_table` of the one whose images points are looked up in; from_base: its lines.
+    launch: the launch's first pair, and the last of all, which it repeats where there are no more. pairs: current view
+    and reference of each pair. own: of each pair the reference's 1 / median depth (1/m), and gain and offset of the
+    current image against it. error: as in `Optics`. constants: those of `Scaling`, two of the kernel's own, and units
+    of the unknowns.
     """
 
     depth: Any
+    camera: Any
     rays_x: Any
     rays_y: Any
     to_base: Any
-    image: Any
     from_base: Any
     launch: Any
     pairs: Any
     own: Any
-    camera: Any
     error: Any
     constants: Any
 
 
-Given = DepthPairInput | ColorPairInput
+@dataclass(frozen=True)
+class DepthPairInput(GeometricInput, PairInput):
+    """And what of `GeometricInput` is the reference's surface: atlases."""
+
+
+@dataclass(frozen=True)
+class ColorPairInput(PairInput):
+    """And image: an atlas of intensities, NaN where they are unusable. depth: of what the colour camera sees."""
+
+    image: Any
 
 
 @dataclass(frozen=True)
@@ -85,7 +79,7 @@ class PairGrid:
     meant: Any
 
 
-def pair_grid(e: Engine, depth: Lens, raster: Raster, pixels: PixelGrid, given: Given) -> PairGrid:
+def pair_grid(e: Engine, depth: Lens, raster: Raster, pixels: PixelGrid, given: PairInput) -> PairGrid:
     """From pixels of depth images, one after the other in order of the pairs: below each other where they are read by
     rows, else side by side. raster: of one image."""
     stride, columns = raster.stride, raster.columns
@@ -120,7 +114,9 @@ class Point:
     active: Any
 
 
-def _points(e: Engine, depth: Lens, raster: Raster, pixels: PairGrid, view: Any, asked: Asked, given: Given) -> Point:
+def _points(
+    e: Engine, depth: Lens, raster: Raster, pixels: PairGrid, view: Any, asked: Asked, given: PairInput
+) -> Point:
     """Of pixels of a view's depth image."""
     z = dr.gather(e.Float, given.depth, view * raster.count + pixels.number)
     xn, yn = (dr.gather(e.Float, rays, pixels.number) for rays in (given.rays_x, given.rays_y))

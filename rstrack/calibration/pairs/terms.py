@@ -111,11 +111,9 @@ class PairTerms:
         gate = max(GATE_SIGMAS * sigma, 10.0 * FLOOR_DEPTH)
         unit = units(self.asked.depth, scaling.median_depth)
         constants = np.concatenate([scaling.parameters(sigma, gate), [_SMOOTH * sigma, 0.0], unit])
-        tables = self.e.upload(lines.to_base), self.e.upload(lines.from_base)
+        given = self._of_pairs(images, pairs, (lines, lines), optics, np.zeros((len(pairs), 2)), constants)
         surfaces = images.inverse_depth, images.slope_x, images.slope_y, images.roughness
-        geometric = images.z, optics.rays_x, optics.rays_y, tables[0], *surfaces, tables[1]
-        of_pairs = self._of_pairs(images, pairs, np.zeros((len(pairs), 2)))
-        return DepthPairInput(*geometric, self.e.upload(constants), *of_pairs, optics.depth_camera, optics.error)
+        return DepthPairInput(images.z, optics.depth_camera, *given, *surfaces)
 
     def color_input(
         self, images: WindowImages, level: int, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
@@ -124,16 +122,18 @@ class PairTerms:
         """What the colour kernel takes; see `by_color`."""
         unit = units(self.asked.color, scaling.median_depth)
         constants = np.concatenate([scaling.parameters(sigma, GATE_INTENSITY), [0.0, 0.0], unit])
-        points = images.shown_z, optics.rays_x, optics.rays_y, self.e.upload(lines[0].to_base)
-        seen = images.levels[level], self.e.upload(lines[1].from_base)
-        of_pairs = self._of_pairs(images, pairs, brightness[pairs[:, 0], pairs[:, 1]])
-        return ColorPairInput(*points, *seen, *of_pairs, optics.color_camera, optics.error, self.e.upload(constants))
+        given = self._of_pairs(images, pairs, lines, optics, brightness[pairs[:, 0], pairs[:, 1]], constants)
+        return ColorPairInput(images.shown_z, optics.color_camera, *given, images.levels[level])
 
-    def _of_pairs(self, images: WindowImages, pairs: IntArray, brightness: FloatArray) -> tuple[Any, Any, Any]:
-        """`launch`, of all, `pairs` and `own` of the inputs."""
-        own = np.column_stack([1.0 / images.median_depth[pairs[:, 1]], brightness])
-        whole = self.e.UInt(aligned([0, len(pairs) - 1], np.uint32))
-        return whole, self.e.UInt(aligned(pairs, np.uint32)), self.e.upload(own)
+    def _of_pairs(
+        self, images: WindowImages, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
+        brightness: FloatArray, constants: FloatArray,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        """What `PairInput` has from rays_x on, all pairs in one launch; lines: of depth and of what is looked into."""
+        e, own = self.e, np.column_stack([1.0 / images.median_depth[pairs[:, 1]], brightness])
+        launch, of = (e.UInt(aligned(numbers, np.uint32)) for numbers in ([0, len(pairs) - 1], pairs))
+        placed = optics.rays_x, optics.rays_y, e.upload(lines[0].to_base), e.upload(lines[1].from_base)
+        return *placed, launch, of, e.upload(own), optics.error, e.upload(constants)
 
     def _in_launches(
         self, given: DepthPairInput | ColorPairInput, what: tuple[Any, ...], pairs: IntArray, scaling: Scaling,

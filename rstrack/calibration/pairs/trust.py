@@ -18,7 +18,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rstrack.alignment.block_sums import Scaling, every
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
 from rstrack.calibration.pairs.images import ACROSS, LinePoses, lines_of
-from rstrack.calibration.pairs.kernels import Given, PairGrid, color_residual, depth_residual, in_atlas, pair_grid
+from rstrack.calibration.pairs.kernels import PairGrid, PairInput, color_residual, depth_residual, in_atlas, pair_grid
 from rstrack.calibration.pairs.optics import turn
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow
@@ -80,7 +80,7 @@ def _by_color(
     return _twists(of.p, of.own, of.other, of.active & (abs(of.r) < GATE_INTENSITY), sigma)
 
 
-def _pair_grid(terms: PairTerms, given: Given) -> tuple[Raster, PairGrid]:
+def _pair_grid(terms: PairTerms, given: PairInput) -> tuple[Raster, PairGrid]:
     camera, stride = terms.depth.camera, terms.stride
     raster, pixels = Raster.of(camera, stride), every(terms.e, camera.width, camera.height, stride)
     return raster, pair_grid(terms.e, terms.depth, raster, pixels, given)
