@@ -125,7 +125,7 @@ class ImuTerm:
         """Of the samples within valid (k, 2), s: where the spline is an estimate; None without any, or a gyroscope."""
         samples = ImuReadings.of(recording)
         begin, end = np.maximum(valid[:, 0], spline.t_begin), np.minimum(valid[:, 1], spline.t_end)
-        inside = ((samples.t[:, None] >= begin) & (samples.t[:, None] < end)).any(axis=1)
+        inside = np.asarray(((samples.t[:, None] >= begin) & (samples.t[:, None] < end)).any(axis=1))
         if recording.gyro is None or not inside.any():
             return None
         samples = samples[inside]

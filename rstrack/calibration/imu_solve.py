@@ -107,7 +107,7 @@ def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda 
     at_frames = data.track.corrections(data.frame_times)
     slow_times = np.arange(data.frame_times[0], data.frame_times[-1] + _SLOW_S, _SLOW_S)
     slow, weights = np.zeros((len(slow_times), 6)), hats(slow_times, data.frame_times)
-    sizes, size = ErrorSizes(*data.sigmas, _POSES, _STEPS), imu.size
+    sizes, size = ErrorSizes(data.sigmas[0], data.sigmas[1], _POSES, _STEPS), imu.size
     for iteration in range(1, _MOST + 1):
         done(iteration)
         normal = _samples(data, imu, x, sizes)

@@ -204,7 +204,7 @@ def without(
     """
     own, gradient = (H[gone, gone], g[gone]) if more is None else (H[gone, gone] + more[0], g[gone] + more[1])
     solved = np.linalg.solve(own, np.column_stack([H[gone, kept], gradient]))
-    rest, step = H[kept, kept] - H[kept, gone] @ solved[:, :-1], solved[:, -1]
+    rest, step = H[kept, kept] - H[kept, gone] @ solved[:, :-1], np.asarray(solved[:, -1])
     return 0.5 * (rest + rest.T), g[kept] - H[kept, gone] @ step, step, 0.5 * float(gradient @ step)
 
 

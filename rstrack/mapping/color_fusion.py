@@ -51,7 +51,7 @@ class LinearImage:
 class FusedColor:
     """Linear RGB and sums of weights of a keyframe's pixels, flat, on the device; weight 0: nothing seen yet."""
 
-    rgb: tuple[Any, ...]
+    rgb: tuple[Any, Any, Any]
     weight: Any
     shape: tuple[int, int]
 
@@ -100,18 +100,18 @@ class ColorFusion:
         )
         inv_sigma2 = 0.0 if self.sigma_px is None else self.sigma_px**-2
         constants = e.upload(np.array([inv_sigma2, _LEAST, _MOST]))
-        *rgb, weight = kernel(
+        r, g, b, weight = kernel(
             _AddInput(ref.inverse_depth, *fused.rgb, fused.weight, image.rgb, depth.z, *tables, constants)
         )
-        return FusedColor(tuple(rgb), weight, fused.shape)
+        return FusedColor((r, g, b), weight, fused.shape)
 
     def inherit(self, ref: Reference, older: FusedColor, older_ref: Reference) -> FusedColor:
         """What an older keyframe knows of the colours of a new one, with its weights."""
         pose = self.e.upload(rows_of(se3.inverse(older_ref.T_world_base) @ ref.T_world_base))
         kernel = self._kernel(_inherit_kernel, older_ref.lens, ref.lens)
         given = _InheritInput(ref.inverse_depth, *older.rgb, older.weight, older_ref.inverse_depth, pose)
-        *rgb, weight = kernel(given)
-        return FusedColor(tuple(rgb), weight, (ref.lens.camera.height, ref.lens.camera.width))
+        r, g, b, weight = kernel(given)
+        return FusedColor((r, g, b), weight, (ref.lens.camera.height, ref.lens.camera.width))
 
     def image(self, fused: FusedColor) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
         """sRGB (h, w, 3), 0 in holes, and the sums of weights (h, w)."""

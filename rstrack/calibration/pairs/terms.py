@@ -113,7 +113,7 @@ class PairTerms:
         constants = np.concatenate([scaling.parameters(sigma, gate), [_SMOOTH * sigma, 0.0], unit])
         given = self._of_pairs(images, pairs, (lines, lines), optics, np.zeros((len(pairs), 2)), constants)
         surfaces = images.inverse_depth, images.slope_x, images.slope_y, images.roughness
-        return DepthPairInput(images.z, optics.depth_camera, *given, *surfaces)
+        return DepthPairInput(*(images.z, optics.depth_camera, *given, *surfaces))
 
     def color_input(
         self, images: WindowImages, level: int, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
@@ -123,7 +123,7 @@ class PairTerms:
         unit = units(self.asked.color, scaling.median_depth)
         constants = np.concatenate([scaling.parameters(sigma, GATE_INTENSITY), [0.0, 0.0], unit])
         given = self._of_pairs(images, pairs, lines, optics, brightness[pairs[:, 0], pairs[:, 1]], constants)
-        return ColorPairInput(images.shown_z, optics.color_camera, *given, images.levels[level])
+        return ColorPairInput(*(images.shown_z, optics.color_camera, *given, images.levels[level]))
 
     def _of_pairs(
         self, images: WindowImages, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
