@@ -97,7 +97,6 @@ class ImuSolution:
     covariance: FloatArray
     x: FloatArray
     sizes: ErrorSizes
-    iterations: int
 
 
 def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda _: None) -> ImuSolution:
@@ -133,7 +132,7 @@ def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda 
         if not np.isfinite(moved).all():
             break
         if iteration > 3 and moved.max() < _SETTLED and sizes.like(before, _SAME):
-            return ImuSolution(imu, covariance, x, sizes, iteration)
+            return ImuSolution(imu, covariance, x, sizes)
     raise UserError(f"{_TOO_LITTLE} (no solution after {_MOST} steps)")
 
 
