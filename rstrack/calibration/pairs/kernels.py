@@ -23,7 +23,7 @@ from rstrack.alignment.block_sums import Blocks, Contribution, PixelGrid, Runs, 
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.images import ACROSS
-from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
+from rstrack.calibration.pairs.optics import Asked, traced, turned_round, unknown_columns, without_error
 from rstrack.images.sampling import PyramidLevel, Raster, cubic_value_and_slope, surface
 
 
@@ -256,12 +256,9 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: 
         def at(pixels: PixelGrid) -> Contribution:
             grid = pair_grid(e, depth, raster, pixels, given)
             of_pixel = depth_residual(e, depth, raster, grid, asked, given)
-            point, seen, columns = of_pixel.at, of_pixel.seen, []
-            if names:
-                own = project(of_pixel.lens.camera, point.q), seen.at
-                here, there = (moves(names, of_pixel.lens.camera, one) for one in own)
-                shifts = zip(there, here, strict=True)
-                columns = unknown_columns(e, of_pixel.g, shifts, seen.M, point.T_base_cam, given.constants)
+            point, seen, camera = of_pixel.at, of_pixel.seen, of_pixel.lens.camera
+            both = (seen.at, seen.M), (project(camera, point.q), point.T_base_cam)
+            columns = unknown_columns(e, names, camera, of_pixel.g, *both, given.constants)
             slot = grid.launched * pair.size + block_slot(point.line, seen.row, blocks, grid.y, len(names))
             judged = of_pixel.is_smooth, len(names)
             motion = of_pixel.g, point.p, 1.0, of_pixel.r, of_pixel.active
@@ -294,11 +291,10 @@ def color_pair_kernel(
         def at(pixels: PixelGrid) -> Contribution:
             grid = pair_grid(e, depth, raster, pixels, given)
             of = color_residual(e, color, depth, raster, grid, image, asked, given)
-            here, there, columns = of.here, of.there, []
+            here, there = of.here, of.there
             a, b, c = (0.5 * dr.fma(1.0 + of.gain, two, one) for one, two in zip(of.own, of.other, strict=True))
-            if names:
-                shifts = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
-                columns = unknown_columns(e, (a, b, c), shifts, here.M, turned_round(there.M), given.constants)
+            both = (here.at, here.M), (there.at, turned_round(there.M))
+            columns = unknown_columns(e, names, of.lens.camera, (a, b, c), *both, given.constants)
             columns += [-of.contrast, e.Float(-1.0)]
             slot = grid.launched * pair.size + block_slot(here.row, there.row, blocks, here.y, len(columns))
             # A twist of the camera moves the point the other way.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,18 +109,18 @@ def moves(names: Sequence[str], camera: Camera, at: Projection) -> list[Vector]:
 
 
 def unknown_columns(
-    e: Engine, g: Vector, shifts: Iterable[tuple[Vector, Vector]], cam_base: list[Any], base_cam: list[Any],
-    constants: Any,
+    e: Engine, names: Sequence[str], camera: Camera, g: Vector, seen: tuple[Projection, list[Any]],
+    other: tuple[Projection, list[Any]], constants: Any,
 ) -> list[Any]:  # fmt: skip
-    """Columns of unknowns, at most 1, from g, the derivative by a shift in the base frame.
+    """Columns of unknowns of a camera, at most 1, from g, the derivative by a shift in the base frame.
 
-    shifts: by `moves`, in the camera that sees the point (cam_base: its R_cam_base, as `gather` has it), and in the
-    other one (base_cam: its R_base_cam). constants: `units` from the ninth on.
+    seen: where the image that sees the point has it, and its R_cam_base, as `gather` has it; other: likewise of the
+    other image, but R_base_cam. constants: `units` from the ninth on.
     """
     bound, found = dr.gather(e.Float, constants, e.UInt(3)), []
-    back = turned_round(cam_base)
-    for k, (there, here) in enumerate(shifts):
-        a, b = turn(back, there), turn(base_cam, here)
+    back, shifts = turned_round(seen[1]), (moves(names, camera, at) for at, _ in (seen, other))
+    for k, (there, here) in enumerate(zip(*shifts, strict=True)):
+        a, b = turn(back, there), turn(other[1], here)
         c = g[0] * (a[0] - b[0]) + g[1] * (a[1] - b[1]) + g[2] * (a[2] - b[2])
         unit = dr.gather(e.Float, constants, e.UInt(9 + k)) * bound
         found.append(dr.clip(c / unit, -1.0, 1.0))
