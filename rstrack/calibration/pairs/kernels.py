@@ -16,7 +16,7 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine, Numbers, quotient, recorded_with
+from rsgen.device.arrays import Engine, quotient, recorded_with
 from rsgen.device.lens import Lens, TracedCamera
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
 from rstrack.alignment.block_sums import Blocks, Contribution, PixelGrid, Runs, block_slot, contribution, sizes, summed
@@ -228,13 +228,6 @@ def color_residual(
     return ColorResidual(lens, at.p, here, there, r, own, other, gain, contrast, active)
 
 
-@dataclass(frozen=True)
-class PairSize(Numbers):
-    """Integers that a pair's sums have."""
-
-    size: int
-
-
 def _room(pairs: int, size: int) -> int:
     """Integers of so many pairs, which have `size` each, with some to spare: their number is compiled in.
 
@@ -249,8 +242,8 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: 
     size, values = sizes(depth, depth, len(names))
     of_lens = depth, Raster.of(depth.camera, stride), Blocks.of(depth, depth), _runs(e, depth, stride, pairs)
 
-    @recorded_with(e, DepthPairInput, *of_lens, PairSize(size))
-    def kernel(given: DepthPairInput, depth: Lens, raster: Raster, blocks: Blocks, runs: Runs, pair: PairSize) -> Any:
+    @recorded_with(e, DepthPairInput, *of_lens)
+    def kernel(given: DepthPairInput, depth: Lens, raster: Raster, blocks: Blocks, runs: Runs) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
@@ -259,7 +252,7 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: 
             point, seen, camera = of_pixel.at, of_pixel.seen, of_pixel.lens.camera
             both = (seen.at, seen.M), (project(camera, point.q), point.T_base_cam)
             columns = unknown_columns(e, names, camera, of_pixel.g, *both, given.constants)
-            slot = grid.launched * pair.size + block_slot(point.line, seen.row, blocks, grid.y, len(names))
+            slot = grid.launched * size + block_slot(point.line, seen.row, blocks, grid.y, len(names))
             judged = of_pixel.is_smooth, len(names)
             motion = of_pixel.g, point.p, 1.0, of_pixel.r, of_pixel.active
             return contribution(e, *motion, parameters, slot, columns, *judged)
@@ -279,12 +272,12 @@ def color_pair_kernel(
     names = asked.color
     size, values = sizes(color, color, len(names) + 2)
     of_depth = depth, Raster.of(depth.camera, stride), _runs(e, depth, stride, pairs)
-    of_color = color, PyramidLevel.of(color.camera, level), Blocks.of(color, color), PairSize(size)
+    of_color = color, PyramidLevel.of(color.camera, level), Blocks.of(color, color)
 
     @recorded_with(e, ColorPairInput, *of_depth, *of_color)
     def kernel(
         given: ColorPairInput, depth: Lens, raster: Raster, runs: Runs, color: Lens, image: PyramidLevel,
-        blocks: Blocks, pair: PairSize,
+        blocks: Blocks,
     ) -> Any:  # fmt: skip
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
@@ -296,7 +289,7 @@ def color_pair_kernel(
             both = (here.at, here.M), (there.at, turned_round(there.M))
             columns = unknown_columns(e, names, of.lens.camera, (a, b, c), *both, given.constants)
             columns += [-of.contrast, e.Float(-1.0)]
-            slot = grid.launched * pair.size + block_slot(here.row, there.row, blocks, here.y, len(columns))
+            slot = grid.launched * size + block_slot(here.row, there.row, blocks, here.y, len(columns))
             # A twist of the camera moves the point the other way.
             return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns, True, len(names))
 
