@@ -209,18 +209,6 @@ def without(
 
 
 @dataclass(frozen=True)
-class Scatter:
-    """Residuals r (n, 6), and by_imu (n, 6, 12) what an estimate's numbers do to them."""
-
-    r: FloatArray
-    by_imu: FloatArray
-
-    def after(self, change: FloatArray) -> FloatArray:
-        """(n, 6), where these have changed by (12,), to first order in the turn."""
-        return self.r + self.by_imu @ change
-
-
-@dataclass(frozen=True)
 class ImuResiduals:
     """Residuals of n samples, linearised: r (n, 6), J (n, 6, 36) their derivatives by the four control points and by a
     estimate's numbers, first (n,) the first of these control points."""
@@ -255,14 +243,17 @@ class ImuResiduals:
         step = increments[self.first[:, None] - first + np.arange(4)].reshape(len(self.r), 24, 1)
         return ImuResiduals(self.samples, self.r + (self.J[:, :, :24] @ step)[..., 0], self.J, self.first)
 
-    def summed(self, sigma: FloatArray) -> tuple[ImuQuadratic | None, Scatter]:
-        """Their normal equations, and how they scatter about the spline and an estimate's numbers.
+    def after(self, change: FloatArray) -> FloatArray:
+        """r (n, 6), where the estimate's numbers have changed by (12,), to first order in the turn."""
+        return self.r + self.J[:, :, 24:] @ change
 
-        sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²). None without samples.
+    def summed(self, sigma: FloatArray) -> ImuQuadratic | None:
+        """Their normal equations; None without samples.
+
+        sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²).
         """
-        scatter = Scatter(self.r, self.J[:, :, 24:])
         if not len(self.r):
-            return None, scatter
+            return None
         root = self.samples.counts / np.repeat(sigma, 3)
         whitened = np.concatenate([self.J, self.r[..., None]], axis=2) * root[..., None]
         starts = np.flatnonzero(np.diff(self.first, prepend=self.first[0] - 1))
@@ -276,4 +267,4 @@ class ImuResiduals:
             for to, own in ((slice(low, low + 24), slice(0, 24)), (tail, slice(24, None))):
                 total[to, tail] += squares[own, 24:]
                 total[to, low : low + 24] += squares[own, :24]
-        return ImuQuadratic(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1])), scatter
+        return ImuQuadratic(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1]))

@@ -144,7 +144,7 @@ class Inertia:
         def around() -> tuple[Quadratic, float]:
             nonlocal numbers
             for _ in range(2):
-                joint, _ = self._rows(state, samples, numbers).summed(self.sigma)
+                joint = self._rows(state, samples, numbers).summed(self.sigma)
                 if joint is None:
                     return Quadratic(state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
                 model, cost, best = joint.without_imu(estimate, numbers)
@@ -182,7 +182,7 @@ class Inertia:
             cost = both.reach(state, both.first, state.end)
             rows = self._rows(state, samples, self.estimate.mean)
             self._ahead = state, both.first, both.at, rows
-            joint, _ = rows.summed(self.sigma)
+            joint = rows.summed(self.sigma)
             if joint is not None:
                 both.add(joint)
                 cost += joint.cost
@@ -220,7 +220,8 @@ class Inertia:
         self._leaves_open = bool(np.linalg.eigvalsh(_OPEN[:, None] * seen * _OPEN)[0] < 1.0)
         for model in models:
             smoother.add(model)
-        joint, scatter = self._rows_known(state, fresh).summed(self.sigma)
+        rows = self._rows_known(state, fresh)
+        joint = rows.summed(self.sigma)
         if joint is not None:
             smoother.add(joint)
             smoother.diffuse(self._walk * max(1e-6, float(self._until - begin)))
@@ -229,7 +230,7 @@ class Inertia:
         before = self.estimate.mean
         self._update(smoother)
         if joint is not None and self.is_informative:
-            self._learn_sigma(scatter.after(self.estimate.mean - before), fresh.counts, state.dt)
+            self._learn_sigma(rows.after(self.estimate.mean - before), fresh.counts, state.dt)
         if not self.is_usable:
             T, twist = state.spline.pose_and_velocity(self._until)
             R_imu_depth = self.recording.T_imu_depth[:3, :3]

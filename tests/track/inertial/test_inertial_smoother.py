@@ -93,7 +93,7 @@ def test_a_small_problem_is_solved_as_by_scipy() -> None:
         smoother.reach(state, 0, count)
         for t, T in poses:
             smoother.add(pose_constraint(state.spline, t, T, POSE_SIGMA)[0])
-        joint, _ = ImuResiduals.of(state.spline, samples, imu.T_imu_depth, estimate).summed(sigma)
+        joint = ImuResiduals.of(state.spline, samples, imu.T_imu_depth, estimate).summed(sigma)
         assert joint is not None
         smoother.add(joint)
         step = -np.linalg.solve(smoother.H, smoother.g)
