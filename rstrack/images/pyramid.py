@@ -152,9 +152,7 @@ def color_image(
     return ColorImage(exposure, shown, moments, thumbnail(levels[-1]), finer)
 
 
-def in_range(
-    levels: list[npt.NDArray[np.float32]], color: npt.NDArray[np.uint8]
-) -> list[npt.NDArray[np.float32]]:  # fmt: skip
+def in_range(levels: list[npt.NDArray[np.float32]], color: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.float32]]:
     """Levels of a pyramid of intensities (h, w) of an image, NaN where that is saturated or black."""
     masks = _beyond_range(color, len(levels))
     return [np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True)]
