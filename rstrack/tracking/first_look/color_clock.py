@@ -23,7 +23,7 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import UNFOUND_OFFSET_S
-from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, points_of
+from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, pixels_of, points_of
 
 # For the progress bar.
 _STAGE = "colour's clock"
@@ -138,9 +138,14 @@ def _costs(
     """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast."""
     points = lru_cache(maxsize=2)(lambda k: points_of(dataset, spline, k))
     images = lru_cache(maxsize=16)(lambda i: image_of(dataset.images.color(i)))
+
+    @lru_cache(maxsize=3)
+    def at_offsets(k: int, i: int) -> FloatArray:
+        return looked_up(images(i), pixels_of(dataset, spline, points(k), dataset.color_stamps[i] + offsets))
+
     found = [(np.empty((0, len(offsets))), np.empty(0))]
     for n, (k, i, j) in enumerate(pairs):
-        a, b = (looked_up(dataset, spline, images(m), points(k), dataset.color_stamps[m] + offsets) for m in (i, j))
+        a, b = at_offsets(k, i), at_offsets(k, j)
         good = np.isfinite(a).all(axis=0) & np.isfinite(b).all(axis=0)
         if np.count_nonzero(good) >= _FEWEST:
             cost, noise = _disagreement(a[:, good], b[:, good])

@@ -159,7 +159,7 @@ def pairs_in(dataset: Dataset, frames: range, begin: float, end: float) -> list[
 def points_of(dataset: Dataset, spline: Spline, k: int) -> FloatArray:
     """Points (n, 3) in the world of frame k's depth, each line with its own pose."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    step = max(camera.width // _ACROSS, 1)
+    step = max(round(camera.width / _ACROSS), 1)
     pixels = camera.pixel_grid()[::step, ::step].reshape(-1, 2)
     z = dataset.depth(k)[::step, ::step].reshape(-1)
     rays = camera.unproject(pixels)
@@ -173,7 +173,7 @@ def rests(dataset: Dataset, spline: Spline, p_world: FloatArray, k: int) -> npt.
     """Which of points (n, 3) depth image k shows where they were: not what moves by itself, or what it hides."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
     times = shutter.line_mid_time(dataset.stamps[k], np.arange(shutter.line_count(camera)), camera)
-    uv, p_cam = _projected(camera, shutter, se3.inverse(spline.pose(times)), p_world)
+    uv, p_cam, _ = _projected(camera, shutter, se3.inverse(spline.pose(times)), p_world)
     seen = camera.contains(uv)
     u, v = np.rint(np.where(seen[:, None], uv, 0.0)).astype(np.int64).T
     z = dataset.depth(k)[np.minimum(v, camera.height - 1), np.minimum(u, camera.width - 1)]
@@ -182,19 +182,25 @@ def rests(dataset: Dataset, spline: Spline, p_world: FloatArray, k: int) -> npt.
 
 
 def _projected(
-    camera: Camera, shutter: Shutter, T_cam_world: FloatArray, p_world: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels (n, 2) and points (n, 3) in the camera of points (n, 3), whose lines have poses (lines, 4, 4).
+    camera: Camera,
+    shutter: Shutter,
+    T_cam_world: FloatArray,
+    p_world: FloatArray,
+    line: npt.NDArray[np.int64] | None = None,
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:
+    """Pixels (n, 2), points (n, 3) in the camera and lines (n,) of points (n, 3), whose lines have poses (lines, 4, 4).
 
-    Equation (3) by fixed-point iteration, with the pose of the nearest line: a hundredth of a pixel.
+    Equation (3) by fixed-point iteration, with the pose of the nearest line. line (n,): a start that is a few lines off
+    at most, from which one iteration is enough; without it, the image's middle.
     """
-    line = np.full(len(p_world), len(T_cam_world) // 2)
-    for _ in range(_ROUNDS):
+    rounds = _ROUNDS if line is None else 1
+    line = np.full(len(p_world), len(T_cam_world) // 2) if line is None else line
+    for _ in range(rounds):
         p_cam = se3.transform(T_cam_world[line], p_world)
         uv, _ = camera.project(p_cam)
         at = np.nan_to_num(shutter.line_of_pixel(uv, camera))
         line = np.clip(np.rint(at), 0, len(T_cam_world) - 1).astype(np.int64)
-    return uv, p_cam
+    return uv, p_cam, line
 
 
 def image_of(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
@@ -205,18 +211,24 @@ def image_of(color: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     return np.where(near > 0, np.float32(np.nan), grey)
 
 
-def looked_up(
-    dataset: Dataset, spline: Spline, image: npt.NDArray[np.float32], p_world: FloatArray, stamps: FloatArray
-) -> FloatArray:
-    """Intensities (m, n) at points (n, 3) of an image stamped `stamps` (m,); NaN where not seen or clipped."""
+def pixels_of(dataset: Dataset, spline: Spline, p_world: FloatArray, stamps: FloatArray) -> npt.NDArray[np.float32]:
+    """Pixels (m, n, 2) of `image_of` at which colour images stamped `stamps` (m,) have points (n, 3); -10 where unseen.
+
+    stamps: in steps in which points move by a few lines at most.
+    """
     camera, shutter, T_color_depth = dataset.rig.color_camera, dataset.rig.color_shutter, dataset.rig.T_color_depth
-    lines = np.arange(shutter.line_count(camera))
-    out = np.full((len(stamps), len(p_world)), np.nan)
+    lines, line = np.arange(shutter.line_count(camera)), None
+    found = np.empty((len(stamps), len(p_world), 2), np.float32)
     for m, stamp in enumerate(stamps):
         T = T_color_depth @ se3.inverse(spline.pose(shutter.line_mid_time(stamp, lines, camera)))
-        uv, _ = _projected(camera, shutter, T, p_world)
-        uv = np.where(camera.contains(uv)[:, None], 0.5 * uv, -10.0).astype(np.float32)
-        border = cv2.BORDER_CONSTANT
-        u, v = (np.ascontiguousarray(x)[:, None] for x in uv.T)
-        out[m] = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=border, borderValue=float("nan"))[:, 0]
-    return out
+        uv, _, line = _projected(camera, shutter, T, p_world, line)
+        found[m] = np.where(camera.contains(uv)[:, None], 0.5 * uv, -10.0)
+    return found
+
+
+def looked_up(image: npt.NDArray[np.float32], pixels: npt.NDArray[np.float32]) -> FloatArray:
+    """Values (m, n) of an image at pixels (m, n, 2), between pixels linearly; NaN outside and beside NaN."""
+    u, v = (np.ascontiguousarray(x) for x in np.moveaxis(pixels, 2, 0))
+    return np.asarray(
+        cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")), np.float64
+    )

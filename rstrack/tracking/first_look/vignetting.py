@@ -24,7 +24,15 @@ from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rstrack.data.dataset import Dataset
 from rstrack.images.pyramid import corner_distance2
-from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, points_of, rests
+from rstrack.tracking.first_look.rough_track import (
+    GeometricTrack,
+    image_of,
+    looked_up,
+    pairs_in,
+    pixels_of,
+    points_of,
+    rests,
+)
 
 # The fewest points that a pair of images may share, and pairs.
 _FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
@@ -91,9 +99,9 @@ def _compared(dataset: Dataset, track: GeometricTrack, progress: Progress) -> li
     for n, (k, i, j) in enumerate(chosen):
         seen, at = [], []
         for m in (i, j):
-            stamp = dataset.color_stamps[m : m + 1]
-            seen.append(looked_up(dataset, spline, images(m), points(k), stamp)[0])
-            at.append(looked_up(dataset, spline, distance2, points(k), stamp)[0])
+            pixels = pixels_of(dataset, spline, points(k), dataset.color_stamps[m : m + 1])
+            seen.append(looked_up(images(m), pixels)[0])
+            at.append(looked_up(distance2, pixels)[0])
         later = int(np.abs(dataset.stamps - dataset.color_stamps[j]).argmin())
         good = np.isfinite([*seen, *at]).all(axis=0) & rests(dataset, spline, points(k), later)
         if np.count_nonzero(good) >= _FEWEST_POINTS:

@@ -87,6 +87,20 @@ def test_the_offset_is_found_along_the_true_path(shaken: Dataset, wrong_s: float
     assert abs(found.offset_s - wrong_s) < 5.0 * found.sigma_s + 0.1e-3
 
 
+def test_pixels_of_rising_stamps_are_those_of_each_stamp_alone(shaken: Dataset) -> None:
+    truth = shaken.truth
+    assert truth is not None
+    p_world = rough_track.points_of(shaken, truth, 12)
+    stamps = shaken.color_stamps[12] + np.linspace(-0.06, 0.06, 13)
+    together = rough_track.pixels_of(shaken, truth, p_world, stamps)
+    alone = np.concatenate([rough_track.pixels_of(shaken, truth, p_world, stamp[None]) for stamp in stamps])
+    seen = (together[..., 0] > -10.0) & (alone[..., 0] > -10.0)
+    assert seen.mean() > 0.5 and (seen == (alone[..., 0] > -10.0)).mean() > 0.999
+    # Poses are those of the nearest line, which may be the next one: 0.056 px here.
+    off = np.abs(together - alone)[seen]
+    assert off.max() < 0.06 and off.mean() < 0.02
+
+
 def test_a_track_that_colour_contradicts_is_not_believed(shaken: Dataset) -> None:
     truth = shaken.truth
     assert truth is not None
