@@ -86,7 +86,7 @@ def run_tier(tier: str, choice: Choice, scheduler: str | None, quiet: bool) -> i
     from rsgen.console.progress import ProgressDisplay
     from rstrack.bench.cells import load_benchmark
     from rstrack.bench.runner import RECORD, Outcome, run_cells
-    from rstrack.bench.sequences import Sources
+    from rstrack.bench.task import Sources
 
     benchmark = load_benchmark([HERE / "cases.yaml", HERE / f"{tier}.yaml"]).only(choice.only or ())
     before = None if choice.against is None else read_records(choice.against)

@@ -17,7 +17,7 @@ from benchmarks.verdicts import cliff, sentences
 from rsgen.console.tables import Entry, Table, significant
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
-from rstrack.bench.experiments.readout_results import errors, readout_chart
+from rstrack.bench.experiments.readout import errors, readout_chart
 from rstrack.bench.record import CellRecord, methods_in_order, read_records
 from rstrack.bench.tables import (
     Records,

@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rsgen.console.tables import Entry, Table
-from rstrack.bench.machine import stamped
-from rstrack.bench.record import CellRecord, Figures
+from rstrack.bench.record import CellRecord, Figures, stamped
 
 CELL = "size/product/-"
 PACKAGES = ("rsgen", "rstrack", "benchmarks", "scenes")

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rsgen.console.tables import Entry, Table, significant
-from rstrack.bench import paper
+from rstrack.bench.figures import PAPER_FIGURES
 from rstrack.bench.record import CellRecord, figure, methods_in_order
 from rstrack.bench.tables import ERRORS, Records, of_measure
 
@@ -127,7 +127,7 @@ def _of_peers(peers: Sequence[CellRecord], name: str) -> list[tuple[float, str, 
 def _of_paper(ours: CellRecord, name: str) -> list[tuple[float, str, int]]:
     if ours.case != ours.sequence:  # its figures are of whole sequences
         return []
-    return [(figures[name], "the paper", 0) for (case, _), figures in paper.FIGURES.items() if case == ours.case]
+    return [(figures[name], "the paper", 0) for (case, _), figures in PAPER_FIGURES.items() if case == ours.case]
 
 
 @dataclass(frozen=True)

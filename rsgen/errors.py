@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import requires
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
+
+Model = TypeVar("Model")
 
 
 class UserError(Exception):
@@ -34,8 +36,28 @@ def how_to_install(*extras: str, package: str = "") -> str:
     return "pip install " + " ".join(f"'{part}'" for part in found)
 
 
-def first_problem(error: ValidationError, *within: str) -> str:
-    """'FIELD: what is wrong with it' of the first field that a model refuses; `within`: the fields it lies in."""
+def validated(
+    validate: Callable[[Any], Model], data: Any, where: object, *within: str, cure: str = "", unknown: str = ""
+) -> Model:
+    """The data as pydantic validates it: `validate` is a model's model_validate or model_validate_json.
+
+    Raises UserError, 'WHERE: FIELD: what is wrong with it' and the cure; within, unknown: as of `first_problem`.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return validate(data)
+    except ValidationError as error:
+        raise UserError(f"{where}: {first_problem(error, *within, unknown=unknown)}{cure}") from None
+
+
+def first_problem(error: ValidationError, *within: str, unknown: str = "") -> str:
+    """'FIELD: what is wrong with it' of the first field that a model refuses.
+
+    within: the fields it lies in. unknown: which entries there are, said where there is none of that name.
+    """
     first = error.errors()[0]
     where = ".".join(str(part) for part in (*within, *first["loc"])) or "the file"
+    if unknown and first["type"] == "extra_forbidden":
+        return f"{where}: no such entry: {unknown}"
     return f"{where}: {first['msg'].removeprefix('Value error, ')}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -35,16 +36,20 @@ def save(figure: Figure, path: Path) -> None:
     atomic_write(path, buffer.getvalue())
 
 
+def bare_axes(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
+    """A figure of this size, inches, and its axes (rows, columns), which have no ticks."""
+    bare: dict[str, Any] = {"xticks": [], "yticks": []}
+    return plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, subplot_kw=bare)
+
+
 def save_grid(rows: Sequence[Sequence[NDArray]], titles: Sequence[str], path: Path) -> None:
     """Write rows of images, each (h, w, 3) in [0, 1], with a title over each column. Raises UserError."""
     height, width = rows[0][0].shape[:2]
     size = (4.2 * len(titles), 4.2 * height / width * len(rows) + 0.5)
-    figure, axes = plt.subplots(len(rows), len(titles), figsize=size, layout="constrained", squeeze=False)
+    figure, axes = bare_axes(len(rows), len(titles), size)
     for row, images in zip(axes, rows, strict=True):
         for axis, image in zip(row, images, strict=True):
             axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
-            axis.set_xticks([])
-            axis.set_yticks([])
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title)
     save(figure, path)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import math
 import os
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,11 @@ def atomic_write(path: Path, data: bytes) -> None:
         raise write_error(path, error) from None
 
 
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """A text file of these lines, as `atomic_write` writes it. Raises UserError."""
+    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A name beside `path`, of the same suffix, for libraries that write files themselves.
@@ -51,6 +57,37 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise write_error(path, error) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """An empty folder beside `path`, whose own folder is made too, for what is to be there.
+
+    Once the block ends well it is at `path`, in place of what was; else it is deleted. Raises UserError for an OSError.
+    """
+    temporary, old = (path.with_name(f".{path.name}.{os.getpid()}.{word}.tmp") for word in ("new", "old"))
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        yield temporary
+        if path.exists():
+            path.rename(old)
+        os.replace(temporary, path)  # noqa: PTH105 - one name for tests to break
+    except OSError as error:
+        if old.exists() and not path.exists():
+            old.rename(path)
+        raise write_error(path, error) from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def make_folder(folder: Path, named: Path | None = None) -> None:
+    """Make a folder, and those above it, unless it is there. Raises UserError about what was named: by default it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(named or folder, error) from None
 
 
 def write_error(path: Path, error: OSError) -> UserError:
@@ -186,10 +223,8 @@ def _reason(error: OSError) -> str:
 def _is_running(process: int) -> bool:
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
+    except OSError as error:
+        return not isinstance(error, ProcessLookupError)  # but another user's
     return True
 
 

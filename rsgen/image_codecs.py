@@ -88,7 +88,9 @@ def read_png(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> np.
     data = read_bytes(path)
     if (fault := png_fault(data)) is not None:
         raise _damaged(path, "PNG", fault)
-    _check_pixels(path, data, shape)
+    width, height = image_size(data) or (0, 0)
+    if width * height > max(MOST_PIXELS, shape[0] * shape[1]):  # it would be decoded for nothing
+        raise _damaged(path, "PNG", f"it claims {width}x{height} pixels")
     if (image := decoded(data)) is None:
         raise _damaged(path, "PNG", "cannot be decoded")
     _expect(path, image, shape, dtype)
@@ -159,13 +161,6 @@ def png_fault(data: bytes) -> str | None:
             return None if end == len(data) else "data after its end"
         at = end
     return "truncated"
-
-
-def _check_pixels(path: Path, data: bytes, shape: tuple[int, ...]) -> None:
-    """Raises UserError where a picture is far larger than any of `shape` and would be decoded for nothing."""
-    width, height = image_size(data) or (0, 0)
-    if width * height > max(MOST_PIXELS, shape[0] * shape[1]):
-        raise _damaged(path, "PNG", f"it claims {width}x{height} pixels")
 
 
 def _expect(path: Path, array: np.ndarray, shape: tuple[int, ...], dtype: type[np.generic]) -> None:

@@ -49,13 +49,13 @@ def check_input(path: Path, most: int = MOST_BYTES) -> None:
         raise UserError(f"{path}: has {status.st_size} bytes, more than the {most} that are read: it is damaged")
 
 
-def read_arrays(path: Path, names: Iterable[str], most: int = MOST_BYTES) -> dict[str, npt.NDArray[Any]]:
+def read_arrays(path: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:
     """Arrays of an .npz file by their names.
 
     Raises UserError as `check_input` does; OSError, ValueError, KeyError, EOFError or zipfile.BadZipFile where the file
     is none, or damaged, or unpacks to far more than it is.
     """
-    check_input(path, most)
+    check_input(path)
     data = Path(path).read_bytes()
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         unpacked = sum(info.file_size for info in archive.infolist())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
@@ -18,18 +18,13 @@ METHODS: tuple[str, ...] = get_args(Method)
 Peer = Literal["open3d-hybrid", "open3d-icp", "open3d-hybrid-keyframe", "open3d-icp-keyframe"]
 PEERS: tuple[str, ...] = get_args(Peer)
 """Open3D's joint photometric and geometric error or its point-to-plane ICP; to the frame before or to a keyframe."""
-CloudPeer = Literal["kiss-icp", "small-gicp"]
-CLOUD_PEERS: tuple[str, ...] = get_args(CloudPeer)
+CLOUD_PEERS = ("kiss-icp", "small-gicp")
 """Lidar odometries, on the points of depth images."""
-SlamPeer = Literal["orb-slam3"]
-SLAM_PEERS: tuple[str, ...] = get_args(SlamPeer)
+SLAM_PEERS = ("orb-slam3",)
 """Whole SLAM systems, with map and loops."""
 Strategy = Literal["converged", "newest"]
-STRATEGIES: tuple[str, ...] = get_args(Strategy)
 Source = Literal["keyframe", "model"]
-SOURCES: tuple[str, ...] = get_args(Source)
 Loops = Literal["off", "online", "end"]
-LOOPS: tuple[str, ...] = get_args(Loops)
 
 # Knots (s), and where frames are further apart than so long (s), knots as this part of that, up to times (s) over which
 # no motion is carried on.
@@ -114,10 +109,10 @@ class Options:
     ] = 2.0
 
     def __post_init__(self) -> None:
-        chosen = [("method", METHODS), ("keyframe_strategy", STRATEGIES), ("reference", SOURCES)]
-        for name, known in chosen + ([] if self.loops is None else [("loops", LOOPS)]):
-            if getattr(self, name) not in known:
-                raise UserError(f"unknown {name} '{getattr(self, name)}': choose {', '.join(known)}")
+        chosen: dict[str, Any] = {"method": Method, "keyframe_strategy": Strategy, "reference": Source}
+        for name, kind in (chosen if self.loops is None else chosen | {"loops": Loops}).items():
+            if getattr(self, name) not in get_args(kind):
+                raise UserError(f"unknown {name} '{getattr(self, name)}': choose {', '.join(get_args(kind))}")
         if self.knot_spacing_s is not None and not 0.001 <= self.knot_spacing_s <= 1.0:
             raise UserError(f"knot_spacing_s = {self.knot_spacing_s!r} must be between 0.001 and 1 s")
         if not 0.0 <= self.knot_phase <= 1.0:

@@ -29,7 +29,7 @@ WITHOUT_ENGINE = (
     "rsgen.geometry.so3", "rsgen.geometry.se3", "rsgen.geometry.spline", "rsgen.geometry.camera",
     "rsgen.geometry.shutter", "rsgen.sequence.reader", "rsgen.check.verify", "rsgen.config.config",
     "rsgen.sequence.trajectory", "rsgen.motion.fit", "rsgen.motion.statistics", "rsgen.device.backend",
-    "rsgen.console.scheduler", "rsgen.produce.distribute", "rsgen.produce.generate", "rsgen.produce.frame_source",
+    "rsgen.console.scheduler", "rsgen.produce.parts", "rsgen.produce.generate", "rsgen.produce.camera_sources",
     "rsgen.pictures.frames", "rsgen.cli.main", "rsgen.motion.make", "rsgen.sensors.color", "rsgen.sensors.depth",
     "rsgen.sensors.imu", "rsgen.config.sections", *{f"rsgen.formats.export.{export[0]}" for export in EXPORTS.values()},
 )  # fmt: skip

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rstrack.bench.definitions import StrictModel
+from rstrack.bench.cells import StrictModel
 from rstrack.bench.measures.track import WRONG_M
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of

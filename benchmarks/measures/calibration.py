@@ -19,17 +19,16 @@ from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
-from rstrack.bench.definitions import SequenceEntry, StrictModel
+from rstrack.bench.cells import SequenceEntry, StrictModel
 from rstrack.bench.measures.track import track_cell
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
-from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.figures import displacement_px, rms
 from rstrack.calibration.parameters import COLOR_LENS, DRIFT, EXTRINSICS, NAMES, POSES, Parameters
+from rstrack.calibration.record import camera_file_of
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.image_files import NoisyImages
 from rstrack.data.rig import sigma_of_file
 
 # How wrong cameras are stated, and multiples of it: readouts by half, colour's clock in s, extrinsics.
@@ -94,11 +93,8 @@ def calibration_cell(task: Task, progress: Progress) -> Figures:
     trials: list[CalibrationTrial] = []
     for factor in settings.factors:
         for k, unit in enumerate(units):
-            images = dataset.images
-            if noise.sigma_depth or noise.sigma_intensity:
-                seed = task.seed * settings.starts + k
-                images = NoisyImages(images, noise.sigma_depth, noise.sigma_intensity, seed)
-            wrong = stated_wrong(replace(dataset, images=images), truth, factor, unit)
+            noisy = dataset.noisy(noise.sigma_depth, noise.sigma_intensity, task.seed * settings.starts + k)
+            wrong = stated_wrong(noisy, truth, factor, unit)
             trials.append(_trial(task, wrong, truth, factor))
             found = sum(trial.is_found for trial in trials)
             done = len(trials) / (len(units) * len(settings.factors))

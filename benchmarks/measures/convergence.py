@@ -17,7 +17,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.observation import observe
 from rstrack.alignment.spline_state import SplineState
-from rstrack.bench.definitions import StrictModel
+from rstrack.bench.cells import StrictModel
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
 from rstrack.data.dataset import Dataset

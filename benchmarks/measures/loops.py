@@ -20,8 +20,8 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.adjustment.loops import Loop, LoopSearch
+from rstrack.bench.cells import SequenceEntry, StrictModel
 from rstrack.bench.changes import with_color, with_depth
-from rstrack.bench.definitions import SequenceEntry, StrictModel
 from rstrack.bench.record import Figures
 from rstrack.bench.task import Task, settings_of
 from rstrack.data.dataset import Dataset

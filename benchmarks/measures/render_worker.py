@@ -33,7 +33,7 @@ from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.geometry.shutter import Shutter
 from rsgen.produce.parts import lines_of_sight, load_motion, load_scene, mirrored_samples, surfaces_hash
-from rstrack.bench.machine import peak_mb, reset_peak
+from rstrack.bench.record import peak_mb, reset_peak
 
 MODES = ("still", "rs-blur", "path", "rows", "averaged")
 BLUR_S, READOUT_S = 0.020, 0.028
@@ -54,7 +54,7 @@ def light_figures(config: Config, settings: Mapping[str, Any], progress: Progres
         raise UserError("light.mode is 'path': what is measured is baked light")
     view_camera(config, settings["width"])  # a wrong width would else be reported after the bake
     mi = mitsuba(config.backend)
-    from rsgen.light.cache import baked_field
+    from rsgen.light.bake import baked_field
     from rsgen.light.lamps import straight_through_bulbs
     from rsgen.light.quality import estimated_quality
     from rsgen.render.baked import BakedIntegrator

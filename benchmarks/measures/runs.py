@@ -15,10 +15,9 @@ from pydantic import Field
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rstrack.bench.definitions import StrictModel
-from rstrack.bench.machine import peak_mb
+from rstrack.bench.cells import StrictModel
 from rstrack.bench.measures.track import accuracy, estimated
-from rstrack.bench.record import Figures
+from rstrack.bench.record import Figures, peak_mb
 from rstrack.bench.task import Task, settings_of
 from rstrack.data.rig import Frame
 from rstrack.tracking.any_tracker import make_tracker

@@ -14,11 +14,11 @@ from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.sensors.imu import IMU_TRUTH_CSV, IMU_TRUTH_YAML, imu_csv, imu_truth_csv
+from rsgen.sensors.reports import sequence_imu, sequence_target
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.format import STREAMS, ground_truth, pose_lines
 from rsgen.sequence.images import ImageStream, Rig, Sequence
 from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, target_corners_text
-from rsgen.truth.settings import sequence_imu, sequence_target
 
 _BOX_M = 1e-4  # what depth in float32 and a line's rounding leave
 _WORDS = {"color": "colour"}  # names as they are written in words

@@ -25,8 +25,6 @@ Poses = Callable[[Any], FloatArray]
 PSNR_FLOOR_DB = 36.0
 _REFERENCE_DEPTH = 64  # path length of the reference; Russian roulette ends most paths long before
 _REFERENCE_PASS = 64  # samples per pixel of one pass, for progress
-_LEAST_ERROR = 1e-6  # squared: less than that cannot be distinguished from none
-_SURE = 2.0  # standard errors
 _SEEDS = 1_000_000  # of one run's samples
 _BAKED_SPP = 256  # samples of the baked picture: what is compared is its light, not its noise
 
@@ -101,7 +99,7 @@ def compare_light(
         one, other = _encoded(quarters[::2]), _encoded(quarters[1::2])
         exposed = [np.clip(image * config.color.exposure_gain, 0, 1) for image in (*mine, ours_linear, whole)]
         first, second, ours_srgb, their_srgb = map(srgb.encode, exposed)
-        psnr, least = psnr_without_noise((first, second), (one, other))
+        psnr, least = srgb.psnr_without_noise((first, second), (one, other))
         # Of what is exposed: a lamp in the picture, a few pixels of a hundred times the light, would be all there is.
         bias = 100 * float(exposed[2].mean() / exposed[3].mean() - 1)
         found.append(LightView(float(stamp), psnr, least, bias))
@@ -109,21 +107,6 @@ def compare_light(
     if picture is not None:
         save_grid(rows, ["baked", f"path traced, {passes * _REFERENCE_PASS} spp", "difference x 8"], picture)
     return found
-
-
-def psnr_without_noise(
-    ours: tuple[FloatArray, FloatArray], theirs: tuple[FloatArray, FloatArray]
-) -> tuple[float, float]:
-    """PSNR in dB between two noisy pictures (h, w, 3) in 0..1, and what it is at least, two standard errors.
-
-    Of each there are two, of samples that are independent of each other: noise has no part in products of differences
-    that share none of them, on average.
-    """
-    (first, second), (one, other) = ours, theirs
-    square = ((first - one) * (second - other) + (second - one) * (first - other)).mean(axis=-1) / 2
-    error, unsure = max(float(square.mean()), 0.0), float(square.std()) / square.size**0.5
-    psnr, least = (float(-10 * np.log10(max(e, _LEAST_ERROR))) for e in (error, error + _SURE * unsure))
-    return psnr, least
 
 
 def _encoded(pair: FloatArray) -> FloatArray:

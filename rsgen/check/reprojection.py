@@ -1,4 +1,4 @@
-"""Depth of one frame carried to the next with the poses of their rows, and compared with what is seen there."""
+"""Depth checked: carried to the next frame with the poses of their rows, and against an independent ray caster."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
-from rsgen.errors import UserError
+from rsgen.errors import UserError, how_to_install
 from rsgen.geometry import se3
 from rsgen.geometry.shutter import project_rolling
 from rsgen.geometry.spline import Spline
-from rsgen.sequence.images import Rig
+from rsgen.sequence.images import COLOR_DEPTH, ImageStream, Rig
 
 # Depth is interpolated bilinearly in 1/z, exact on planes. Where second differences say that this is off by more, there
 # is an edge, or a curve too tight for the pixels: such places say nothing about poses, at any resolution.
@@ -121,8 +121,9 @@ def check_scene(sequence: Rig) -> tuple[bool, str]:
         raise UserError(f"{path}: is not a whole mesh: write it again")
     outside = 0.0
     for stream in (stream for stream in sequence.streams.values() if stream.is_depth):
-        for k in np.unique(np.linspace(0, len(stream.paths) - 1, _SCENE_FRAMES).round().astype(int)):
-            p_world = depth_points(sequence, int(k), stream.name)
+        for k in _spread(len(stream.paths), _SCENE_FRAMES):
+            p_world, number, _ = _depth_pixels(sequence, k, stream.name)
+            p_world = p_world[number == 0]
             outside = max(outside, float(np.maximum(bounds[0] - p_world, p_world - bounds[1]).max(initial=0.0)))
     size = " x ".join(f"{length:.2f}" for length in bounds[1] - bounds[0])
     detail = f"{counts[1]} triangles, {size} m, depth at most {outside * 1e3:.3f} mm outside"
@@ -151,17 +152,17 @@ def reproject_depth(sequence: Rig, k: int, next_k: int, name: str = "depth") -> 
     stream = sequence.streams[name]
     stamp = float(stream.stamps[next_k])
     next_z = sequence.exact_depth(name, next_k).astype(np.float64)
-    seen = _depth_pixels(sequence, k, name)
+    p_world, number, t_seen = _depth_pixels(sequence, k, name)
     residuals, numbers, occluded = [np.zeros(0)], [np.zeros(0, np.int64)], 0
     for which in range(len(sequence.objects) + 1):
-        here = seen.number == which
+        here = number == which
         if not here.any():
             continue
-        points: FloatArray = seen.p_world[here]
+        points = p_world[here]
         motion: Any = sequence.spline
         if which:
             thing = sequence.objects[which - 1]
-            points = se3.transform(se3.inverse(thing.spline.pose(seen.t[here])), points)
+            points = se3.transform(se3.inverse(thing.spline.pose(t_seen[here])), points)
             motion = RelativeMotion(sequence.spline, thing.spline)
         uv_next, t, valid = project_rolling(motion, np.eye(4), stream.camera, stream.shutter, stamp, points)
         uv_next, t = uv_next[valid], t[valid]
@@ -175,26 +176,12 @@ def reproject_depth(sequence: Rig, k: int, next_k: int, name: str = "depth") -> 
     return Reprojection(np.concatenate(residuals), occluded, np.concatenate(numbers))
 
 
-def depth_points(sequence: Rig, k: int, name: str) -> FloatArray:
-    """Points (n, 3) in the world that every fourth pixel of exact depth k shows, each from its own line's pose.
+def _depth_pixels(sequence: Rig, k: int, name: str) -> tuple[FloatArray, IntArray, FloatArray]:
+    """What every fourth row and column of exact depth k of a camera shows, each pixel from its own line's pose.
 
-    Without those on moving objects. Raises UserError for unreadable files.
+    Points (n, 3) in the world, numbers (n,) of the objects they are on, and their lines' times (n,), s. Raises
+    UserError for unreadable files.
     """
-    seen = _depth_pixels(sequence, k, name)
-    return seen.p_world[seen.number == 0]
-
-
-@dataclass(frozen=True)
-class _DepthPixels:
-    """n pixels: points (n, 3) in the world, numbers (n,) of the objects they are on, and their lines' times (n,), s."""
-
-    p_world: FloatArray
-    number: IntArray
-    t: FloatArray
-
-
-def _depth_pixels(sequence: Rig, k: int, name: str) -> _DepthPixels:
-    """What every fourth row and column of exact depth k of a camera shows."""
     stream = sequence.streams[name]
     camera = stream.camera
     step = max(1, min(_STEP_PX, math.isqrt(camera.width * camera.height // _TARGET_PIXELS)))
@@ -202,7 +189,7 @@ def _depth_pixels(sequence: Rig, k: int, name: str) -> _DepthPixels:
     uv = camera.pixel_grid()[::step, ::step][z > 0]
     p_world = se3.transform(sequence.pixel_poses(name, k, uv), camera.backproject(uv, z[z > 0]))
     t = stream.shutter.line_mid_time(float(stream.stamps[k]), stream.shutter.line_of_pixel(uv, camera), camera)
-    return _DepthPixels(p_world, sequence.object_ids(name, k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t))
+    return p_world, sequence.object_ids(name, k)[::step, ::step][z > 0].astype(np.int64), np.asarray(t)
 
 
 def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -225,5 +212,75 @@ def _interpolate_inverse(z: FloatArray, uv: FloatArray) -> tuple[FloatArray, Boo
 def _neighbours(sequence: Rig, name: str, pairs: int) -> list[tuple[int, int]]:
     """Up to `pairs` pairs of consecutive depth frames, spread evenly."""
     first = np.flatnonzero(np.diff(sequence.streams[name].indices) == 1)
-    chosen = np.unique(np.linspace(0, max(len(first) - 1, 0), min(pairs, len(first))).round().astype(int))
-    return [(int(first[i]), int(first[i]) + 1) for i in chosen]
+    return [(int(first[i]), int(first[i]) + 1) for i in _spread(len(first), min(pairs, len(first)))]
+
+
+def _spread(total: int, count: int) -> list[int]:
+    """Numbers of so many of `total` things, spread evenly; fewer where there are not as many."""
+    return np.unique(np.linspace(0, total - 1, count).round().astype(int)).tolist()
+
+
+CAST_TOLERANCE_M = 1e-4
+CAST_SHARE = 0.999
+
+
+def check_raycast(sequence: Rig, name: str, count: int) -> tuple[bool, str]:
+    """Cast every pixel of `count` frames of a camera, spread over the sequence, again on scene.ply and compare.
+
+    Of a depth camera, or of another one that has exact depth beside its images (`truth.color_depth`). By trimesh with
+    Embree, from the rows' poses in float64. What moves by itself is cast in its own frame, with each ray moved to where
+    the object is at its line's time.
+
+    True if in every frame at least CAST_SHARE of the pixels are within CAST_TOLERANCE_M and of the right object. Raises
+    UserError if embreex is not installed, or scene.ply or a frame cannot be read.
+    """
+    casters = [_caster(path) for path in (sequence.root / "scene.ply", *(o.mesh for o in sequence.objects))]
+    stream = sequence.streams[name]
+    total = len(stream.stamps)
+    if count < 1 or total == 0:
+        raise UserError(f"{sequence.root}: no {name} frames to cast: ask for at least one")
+    frames = _spread(total, count)
+    differences, shares = [], []
+    for k in frames:
+        z, number = _cast(casters, sequence, stream, k)
+        exact = sequence.exact_depth(name, k) if stream.is_depth else sequence.exact_image(name, COLOR_DEPTH, k)
+        differences.append(np.abs(z - exact))
+        right = (differences[-1] <= CAST_TOLERANCE_M) & (number == sequence.object_ids(name, k))
+        shares.append(float(np.mean(right)))
+    return min(shares) >= CAST_SHARE, (
+        f"{len(frames)} frames, worst: {100 * min(shares):.4f} % of pixels within {1000 * CAST_TOLERANCE_M:g} mm, "
+        f"median difference {1e6 * float(np.median(differences)):.2f} um"
+    )
+
+
+def _caster(path: Path) -> Any:
+    try:
+        from trimesh.ray.ray_pyembree import RayMeshIntersector
+    except ImportError:
+        raise UserError(f"ray casting needs embreex: {how_to_install('raycast')}") from None
+    try:
+        return RayMeshIntersector(trimesh.load(path, process=False, force="mesh"))
+    except Exception as error:
+        raise UserError(f"{path}: cannot be read ({type(error).__name__})") from None
+
+
+def _cast(casters: list[Any], sequence: Rig, stream: ImageStream, k: int) -> tuple[FloatArray, IntArray]:
+    """Planar z (h, w) of listed frame k, 0 where a ray hits nothing, and the number of the object hit (h, w)."""
+    camera = stream.camera
+    uv = camera.pixel_grid().reshape(-1, 2)
+    T_world_cam = sequence.pixel_poses(stream.name, k, uv)
+    exposure_s = stream.shutter.exposure_s if stream.table is None else float(stream.table.exposure_s[k])
+    middle = float(stream.stamps[k]) - 0.5 * (exposure_s - stream.shutter.exposure_s)
+    t = stream.shutter.line_mid_time(middle, stream.shutter.line_of_pixel(uv, camera), camera)
+    z, number = np.full(len(uv), np.inf), np.zeros(len(uv), np.int64)
+    for which, caster in enumerate(casters):
+        T = T_world_cam
+        if which:
+            T = se3.inverse(sequence.objects[which - 1].spline.pose(t)) @ T_world_cam
+        direction = np.einsum("nij,nj->ni", T[:, :3, :3], camera.unproject(uv))
+        _, ray, p = caster.intersects_id(T[:, :3, 3], direction, multiple_hits=False, return_locations=True)
+        there = se3.transform(se3.inverse(T[ray]), p)[:, 2]
+        nearer = there < z[ray]
+        z[ray[nearer]], number[ray[nearer]] = there[nearer], which
+    shape = camera.height, camera.width
+    return np.where(np.isfinite(z), z, 0.0).reshape(shape), number.reshape(shape)

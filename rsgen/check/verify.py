@@ -19,22 +19,15 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.check.extras import extra_checks
-from rsgen.check.reprojection import check_reprojection, check_scene
+from rsgen.check.reprojection import check_raycast, check_reprojection, check_scene
 from rsgen.errors import UserError
 from rsgen.files import is_temporary, read_text
 from rsgen.geometry import se3
 from rsgen.produce.records import fingerprint
-from rsgen.sensors.reports import reported_poses
-from rsgen.sequence.format import (
-    STAMP_TOLERANCE_S,
-    STREAMS,
-    associate,
-    line_poses,
-    pose_rows,
-)
+from rsgen.sensors.reports import reported_poses, sequence_mocap
+from rsgen.sequence.format import STAMP_TOLERANCE_S, STREAMS, associate, line_poses, pose_rows
 from rsgen.sequence.images import COLOR_DEPTH, ImageStream, Rig, Sequence
 from rsgen.sequence.reader import read_rig
-from rsgen.truth.settings import sequence_mocap
 
 # Rows' poses and groundtruth.txt come from the same spline: only the rounding of stamps (5e-10 s) and digits is left.
 POSE_TOLERANCE_M = 1e-7
@@ -80,7 +73,7 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> Verificati
     path = Path(path)
     try:
         stated = read_rig(path)
-        sequence = stated.as_taken if isinstance(stated, Sequence) else stated
+        sequence = stated.as_taken
     except UserError as error:
         return Verification(path, (Check("read", False, str(error)),))
     depths = [name for name, stream in sequence.streams.items() if stream.is_depth]
@@ -97,8 +90,6 @@ def verify_sequence(path: Path, pairs: int = 20, raycast: int = 0) -> Verificati
     ]  # fmt: skip
     checks += extra_checks(sequence)
     if raycast:
-        from rsgen.check.raycast import check_raycast
-
         # Of two cameras depth alone, as always; of a rig all whose exact depth is there.
         of_rig = [name for name, s in sequence.streams.items() if s.is_depth or COLOR_DEPTH in s.truth_images]
         cast = depths if isinstance(sequence, Sequence) else of_rig

@@ -8,9 +8,10 @@ from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Literal
 
+from rsgen.config.config import load_config
 from rsgen.console.command_line import Quiet, refuse_options
 from rsgen.console.configs import config_file
-from rsgen.console.progress import Progress
+from rsgen.console.progress import Progress, ProgressDisplay
 from rsgen.errors import UserError
 from rsgen.formats import EXPORTS, OF_RIGS, exporter
 
@@ -21,7 +22,7 @@ Storage = Literal["sqlite3", "mcap"]
 
 def info(sequence: SequenceFolder) -> int:
     """Say what a sequence folder holds."""
-    from rsgen.sequence.info import sequence_info
+    from rsgen.sequence.reader import sequence_info
 
     print(sequence_info(sequence))
     return 0
@@ -58,7 +59,6 @@ def verify(
     if not chosen.light:
         return 0 if found.ok else 1
     from rsgen.check.light import check_light
-    from rsgen.console.progress import ProgressDisplay
     from rsgen.pictures.frames import config_of
     from rsgen.sequence.reader import read_sequence
 
@@ -108,7 +108,6 @@ def preview(
     sheet of a sequence, or of the motion of a config that has not been rendered yet. Meshes side by side, seen by one
     camera from above or from a place you name.
     """
-    from rsgen.console.progress import ProgressDisplay
     from rsgen.pictures.frames import compare_frame, preview_sequence
     from rsgen.pictures.meshes import parse_point, picture_meshes
 
@@ -144,8 +143,7 @@ def preview(
 
 def _contact_sheet(what: Path, out: Path | None, every_s: float, progress: Progress) -> Path:
     """Of a sequence, else of the config that is called so."""
-    from rsgen.config.config import load_config
-    from rsgen.pictures.sheet import sheet_of_config, sheet_of_sequence
+    from rsgen.pictures.frames import sheet_of_config, sheet_of_sequence
 
     if what.is_dir():
         return sheet_of_sequence(what, out, every_s)
@@ -183,7 +181,6 @@ def export(
     quiet: Quiet = False,
 ) -> int:
     """Write a sequence in the layout of other tools."""
-    from rsgen.console.progress import ProgressDisplay
     from rsgen.formats.export.shared import ExportOptions
     from rsgen.sequence.reader import read_rig, read_sequence
 

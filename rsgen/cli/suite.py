@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 from rsgen.console.command_line import Quiet
+from rsgen.console.progress import ProgressDisplay
 from rsgen.console.scheduler import Scheduler, open_workers
-from rsgen.suite.options import RenderOptions
+from rsgen.suite.definition import RenderOptions, describe_suite, read_definition, suites_folder
 
 SuiteName = Annotated[str | None, "of a suite that ships, or its YAML file (default: name those that ship)"]
 SuiteFolder = Annotated[Path, "folder that 'rsgen suite render' wrote, or a copy of it"]
@@ -15,9 +16,6 @@ SuiteFolder = Annotated[Path, "folder that 'rsgen suite render' wrote, or a copy
 
 def list_(name: SuiteName = None) -> int:
     """List the suites that ship. With a suite's name: its sequences by tier, and what they would take."""
-    from rsgen.suite.definition import read_definition, suites_folder
-    from rsgen.suite.listing import describe_suite
-
     suites = [read_definition(path.stem) for path in sorted(suites_folder().glob("*.yaml"))] if name is None else []
     for suite in suites:
         print(f"{suite.name.lower()}: {suite.name} {suite.version}, tiers {', '.join(suite.tiers)}: {suite.about}")
@@ -38,8 +36,6 @@ def render(
     that is stopped, or killed, goes on with the same command, to the same bytes. --scheduler local:2 renders two
     sequences at a time.
     """
-    from rsgen.console.progress import ProgressDisplay
-    from rsgen.suite.definition import read_definition
     from rsgen.suite.make import render_suite
 
     with ProgressDisplay(quiet) as progress, open_workers(scheduler) as workers:

@@ -17,11 +17,11 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from rsgen.array_types import FloatArray
 from rsgen.config.cameras import ColorConfig, DepthConfig, StreamConfig
 from rsgen.config.faults import FaultsConfig, as_declared, from_recorded, moved_to, to_recorded
-from rsgen.config.imu import ImuConfig
 from rsgen.config.motion import MOST_OBJECTS, MotionConfig, ObjectConfig, TremorConfig, content_of
 from rsgen.config.presets import Preset, with_presets
 from rsgen.config.rig import RigColorConfig, RigStream, T_cam_body, check_stereo, with_left_cameras
 from rsgen.config.sections import (
+    ImuConfig,
     LightConfig,
     MocapConfig,
     SceneConfig,
@@ -241,14 +241,13 @@ def recorded_config(data: dict[str, Any], where: str) -> Config:
 def validate_config(data: dict[str, Any], where: str) -> Config:
     """A config from plain YAML types; `where` begins the message. Raises UserError naming every wrong field."""
     try:
-        return Config.model_validate(_completed(with_presets(data)))
+        data = with_presets(data)
+        if "streams" in data:
+            data = data | {"streams": with_left_cameras(data["streams"])}
+        return Config.model_validate(data)
     except ValidationError as error:
         problems = "; ".join(_problem(e) for e in error.errors())
         raise _error(f"{where}: {problems}") from None
-
-
-def _completed(data: dict[str, Any]) -> dict[str, Any]:
-    return data | {"streams": with_left_cameras(data["streams"])} if "streams" in data else data
 
 
 def _error(text: str) -> UserError:

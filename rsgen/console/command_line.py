@@ -198,35 +198,27 @@ def run_program(
         given = vars(options)
         status: int = given.pop("call")(given)
         sys.stdout.flush()
+        return status
     except UserError as error:
-        print(f"{name}: {_one_line(str(error))}", file=sys.stderr)
-        return 2
+        said = _one_line(str(error))
     except ModuleNotFoundError as error:  # a package's description counts as one: it is told with what was computed
-        print(
-            f"{name}: {error.name} is not installed for {sys.executable}: ./run.sh setup, or pip install .",
-            file=sys.stderr,
-        )
-        return 2
+        said = f"{error.name} is not installed for {sys.executable}: ./run.sh setup, or pip install ."
     except NameError as error:  # Dr.Jit's way to fail where a library of the system is missing
         if not isinstance(error.__context__, ImportError):
             raise
-        said = f"Dr.Jit cannot be loaded ({error.__context__})"
-        print(
-            f"{name}: {said}: install that library (Debian/Ubuntu: 'sudo apt-get install libatomic1')", file=sys.stderr
-        )
-        return 2
+        mend = "install that library (Debian/Ubuntu: 'sudo apt-get install libatomic1')"
+        said = f"Dr.Jit cannot be loaded ({error.__context__}): {mend}"
     except BrokenPipeError:
         # Whoever read our output has seen enough; the interpreter would complain when it flushes the rest.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:  # a name that is too long, a full disk: what no reader or writer has put into words
-        where = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        print(f"{name}: {_one_line(where)}", file=sys.stderr)
-        return 2
+        said = _one_line(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except KeyboardInterrupt:
         print(f"{name}: interrupted; {interrupted}", file=sys.stderr)
         return 130
-    return status
+    print(f"{name}: {said}", file=sys.stderr)
+    return 2
 
 
 def _one_line(text: str) -> str:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from uuid import uuid4
 
 from rsgen.console.progress import Progress
@@ -44,8 +44,8 @@ _AHEAD_PER_WORKER = 4
 _ALLOWED_FAILURES = 5
 
 
-class Workers(Protocol):
-    """What runs jobs; open one with `open_workers`."""
+class Workers:
+    """What runs jobs, opened with `open_workers`: these here, in order."""
 
     def apply(
         self, function: Callable[[Job, Progress], Result], jobs: Sequence[Job], progress: Progress
@@ -57,21 +57,11 @@ class Workers(Protocol):
         job tells `progress` arrives at the caller's, from another thread. Raises what a job raises, and UserError if
         the scheduler or again and again a job's worker is lost.
         """
-        ...
-
-
-class InProcess:
-    """Runs jobs here, in order."""
-
-    def apply(
-        self, function: Callable[[Job, Progress], Result], jobs: Sequence[Job], progress: Progress
-    ) -> Iterator[tuple[int, Result]]:
-        """See `Workers`."""
         for index, job in enumerate(jobs):
             yield index, function(job, progress)
 
 
-class DaskWorkers:
+class DaskWorkers(Workers):
     """Runs jobs on the workers of a Dask scheduler; `client` is connected to it."""
 
     def __init__(self, client: Client, name: str) -> None:
@@ -133,7 +123,7 @@ def open_workers(where: str | None) -> Iterator[Workers]:
     Raises UserError if it is none of these or cannot be reached, or if Dask is not installed.
     """
     if where is None:
-        yield InProcess()
+        yield Workers()
         return
     local = re.fullmatch(r"local(?::([1-9]\d{0,3}))?", where)
     if local is None and not re.fullmatch(r"[a-z]+://\S+|(?!local:)[^\s:/]+:\d+", where):

@@ -8,15 +8,14 @@ rsgen.geometry.camera and rsgen.geometry.shutter; the tests compare them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
 import drjit as dr
 
-from rsgen.device.lens import Lens, contains, distort
-from rsgen.device.pose_table import PoseTable
+from rsgen.device.lens import Lens, PoseTable, contains, distort
 from rsgen.geometry.camera import Camera
 
 Vector = tuple[Any, Any, Any]
@@ -210,18 +209,18 @@ class MovingCamera:
     poses: PoseTable
     carry: Callable[[Any, Vector], Vector] | None = None  # where points that move by themselves are at times t
 
-    def pose(self, t: Any) -> tuple[Vector, tuple[Vector, Vector, Vector]]:
-        """The camera's position and the rows of its rotation R_world_cam."""
-        r0, r1, r2 = self.poses.at(t, beyond=True)  # half a line at most
-        return (r0.w, r1.w, r2.w), ((r0.x, r0.y, r0.z), (r1.x, r1.y, r1.z), (r2.x, r2.y, r2.z))
+    def pose(self, t: Any) -> tuple[Vector, Sequence[Any]]:
+        """The camera's position and the rows of its [R t], T_world_cam."""
+        rows = self.poses.at(t, beyond=True)  # half a line at most
+        return (rows[0].w, rows[1].w, rows[2].w), rows
 
     def project_at(self, t: Any, p: Vector, w: Any) -> tuple[tuple[Any, Any], Any]:
         """Pixels of points seen at times t, and where that is defined (see `Camera.project`)."""
         camera = self.lens.camera
-        origin, R_world_cam = self.pose(t)
+        origin, rows = self.pose(t)
         if self.carry is not None:
             p = self.carry(t, p)
-        q = rotated_back(R_world_cam, (p[0] - w * origin[0], p[1] - w * origin[1], p[2] - w * origin[2]))
+        q = rotated_back(rows, (p[0] - w * origin[0], p[1] - w * origin[1], p[2] - w * origin[2]))
         xn, yn, _, valid = _normalised(camera, q, _TRUTHS_MIN_DEPTH)
         d = distort(camera, xn, yn)
         return (dr.fma(d.x, camera.fx, camera.cx), dr.fma(d.y, camera.fy, camera.cy)), valid
@@ -258,7 +257,14 @@ class MovingCamera:
         return (x, y), half + line * delay, found
 
 
-def rotated_back(R: tuple[Vector, Vector, Vector], v: Vector) -> Vector:
-    """Rᵀ v, given the rotation's rows."""
-    x, y, z = (R[0][k] * v[0] + R[1][k] * v[1] + R[2][k] * v[2] for k in range(3))
+def rotated(rows: Sequence[Any], v: Any) -> Vector:
+    """R v, given the rows of R or of [R t]."""
+    x, y, z = (row[0] * v[0] + row[1] * v[1] + row[2] * v[2] for row in rows)
+    return x, y, z
+
+
+def rotated_back(rows: Sequence[Any], v: Any) -> Vector:
+    """Rᵀ v, given the rows of R or of [R t]."""
+    a, b, c = rows
+    x, y, z = (a[k] * v[0] + b[k] * v[1] + c[k] * v[2] for k in range(3))
     return x, y, z

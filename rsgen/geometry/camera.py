@@ -19,6 +19,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.polynomial import polyval
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
@@ -80,7 +81,7 @@ class Camera:
             raise UserError(
                 f"camera: {self.model} takes {counts} finite distortion coefficients, not {self.distortion}"
             )
-        if self.model == "double_sphere" and not lens.is_double_sphere(*self.distortion):
+        if self.model == "double_sphere" and not (-1.0 < self._sphere[0] <= 1.0 and 0.0 <= self._sphere[1] <= 1.0):
             raise UserError(f"camera: double_sphere takes xi in (-1, 1] and alpha in [0, 1], not {self.distortion}")
 
     @property
@@ -98,7 +99,7 @@ class Camera:
             return math.tan(min(theta, math.atan(_MAX_RADIUS)))
         if self.model == "double_sphere":
             return min(lens.double_sphere_radius(*self._sphere), _MAX_RADIUS)
-        k1, k2, p1, p2, k3 = self._brown
+        k1, k2, p1, p2, k3 = self.brown
         # The Jacobian is symmetric; its radial part has the eigenvalues d and (r d)', the tangential part none below
         # -6 |p| r. Where both sums are positive it is positive definite, and on a disc, being convex, that makes the
         # map one to one.
@@ -148,7 +149,7 @@ class Camera:
         return np.stack([u, v], axis=-1)
 
     @property
-    def _brown(self) -> tuple[float, float, float, float, float]:
+    def brown(self) -> tuple[float, float, float, float, float]:
         """k1 k2 p1 p2 k3 of a radial-tangential or rational camera."""
         k1, k2, p1, p2, k3 = (*self.distortion, 0.0)[:5]
         return k1, k2, p1, p2, k3
@@ -178,7 +179,7 @@ class Camera:
             return xy * self._fisheye_scale(r2)[0][..., None]
         if self.model == "double_sphere":
             return xy * lens.double_sphere_scale(*self._sphere, r2)[0][..., None]
-        _, _, p1, p2, _ = self._brown
+        _, _, p1, p2, _ = self.brown
         d = self._radial_scale(r2)[0]
         return np.stack(
             [x * d + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), y * d + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y],
@@ -194,7 +195,7 @@ class Camera:
         if self.model in ("fisheye", "double_sphere"):
             s, g = self._fisheye_scale(r2) if self.model == "fisheye" else lens.double_sphere_scale(*self._sphere, r2)
             return _symmetric(s + g * x * x, g * x * y, s + g * y * y)
-        _, _, p1, p2, _ = self._brown
+        _, _, p1, p2, _ = self.brown
         s, g = self._radial_scale(r2)
         return _symmetric(
             s + g * x * x + 2.0 * p1 * y + 6.0 * p2 * x,
@@ -204,7 +205,7 @@ class Camera:
 
     def _radial_scale(self, r2: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The radial part's s and g = (ds/dr) / r of a radial-tangential or rational camera."""
-        k1, k2, _, _, k3 = self._brown
+        k1, k2, _, _, k3 = self.brown
         s = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         g = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)))
         if self.model != "rational":
@@ -220,7 +221,7 @@ class Camera:
         theta = np.arctan(r)
         safe_r2 = np.where(r2 > 0.0, r2, 1.0)
         s = np.where(r2 > 0.0, lens.odd(self.distortion, theta) / np.sqrt(safe_r2), 1.0)
-        slope = lens.horner(lens.odd_slope(self.distortion), theta * theta)
+        slope = polyval(theta * theta, lens.odd_slope(self.distortion))
         # g only ever multiplies products of x and y, so what cancels here for small r does no harm.
         return s, np.where(r2 > 0.0, (slope / (1.0 + r2) - s) / safe_r2, 0.0)
 
@@ -240,7 +241,7 @@ class Camera:
             radii = np.tan(np.linspace(0.0, reach, _STARTS))
             start = np.interp(radius, radii * self._radial_scale(radii * radii)[0], radii)
             return self._newton(unit * start[..., None], distorted)
-        k1, k2, p1, p2, k3 = self._brown
+        k1, k2, p1, p2, k3 = self.brown
         without_tangential = lens.invert_odd((k1, k2, k3), radius, self.max_radius)
         if p1 == p2 == 0.0:
             return unit * without_tangential[..., None]

@@ -13,21 +13,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.polynomial.polynomial import polyval
 
 from rsgen.array_types import FloatArray
 
 
-def horner(coefficients: Sequence[float], x: FloatArray) -> FloatArray:
-    """Polynomial with the constant term first."""
-    value = np.full_like(x, coefficients[-1])
-    for k in reversed(coefficients[:-1]):
-        value = value * x + k
-    return np.asarray(value)
-
-
 def odd(ks: Sequence[float], x: FloatArray) -> FloatArray:
     """x (1 + k1 x² + k2 x⁴ + ...)."""
-    return np.asarray(x * horner((1.0, *ks), x * x))
+    return np.asarray(x * polyval(x * x, (1.0, *ks)))
 
 
 def odd_slope(ks: Sequence[float]) -> list[float]:
@@ -71,16 +64,11 @@ def invert_odd(ks: Sequence[float], target: FloatArray, upper: float) -> FloatAr
         if not (np.abs(error) > 4e-16 * (1.0 + goal)).any():
             break
         low, high = np.where(error < 0.0, x, low), np.where(error > 0.0, x, high)
-        rate = horner(slope, x * x)
+        rate = polyval(x * x, slope)
         newton = x - error / np.where(rate > 0.0, rate, np.inf)
         strays = (newton < low) | (newton > high) | (rate <= 0.0)
         x = np.where(error == 0.0, x, np.where(strays, 0.5 * (low + high), newton))
     return np.where(reachable, x, np.nan)
-
-
-def is_double_sphere(xi: float, alpha: float) -> bool:
-    """Whether there is such a lens: xi in (−1, 1], alpha in [0, 1]."""
-    return -1.0 < xi <= 1.0 and 0.0 <= alpha <= 1.0
 
 
 def double_sphere_radius(xi: float, alpha: float) -> float:

@@ -12,10 +12,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.geometry import so3
 from rsgen.geometry.so3 import coefficients, cross, exp_coefficients, hat
 
+# How far R Rᵀ of a rigid motion may be from the identity.
+_ORTHONORMAL_WITHIN = 1e-6
 # Power series of c1..c4 in theta^2; see so3.coefficients for where they replace the closed forms.
 CORNER_SERIES = np.array(
     [
@@ -110,6 +112,14 @@ def orthonormalise(T: npt.ArrayLike) -> FloatArray:
     out[..., :3, 3] = T[..., :3, 3]
     out[..., 3, :] = (0.0, 0.0, 0.0, 1.0)
     return out
+
+
+def is_rigid(T: FloatArray) -> BoolArray:
+    """Whether (n,) finite matrices (n, 4, 4) are rigid motions, up to rounding."""
+    R = T[:, :3, :3]
+    off = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    is_turn = (off <= _ORTHONORMAL_WITHIN) & (np.linalg.det(R) >= 0.0)
+    return np.asarray(is_turn & (T[:, 3] == (0.0, 0.0, 0.0, 1.0)).all(axis=1))
 
 
 def from_quat_trans(q_xyzw: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:

@@ -30,7 +30,6 @@ BY_U = np.diag([1.0, 2.0, 3.0], 1)
 """Derives polynomials in u, constant term first."""
 BASES = _BASIS, BY_U @ _BASIS, BY_U @ BY_U @ _BASIS
 """b_1..b_3 and their first and second derivatives by u, (4, 3) each: powers of u times these."""
-_ORTHONORMAL_WITHIN = 1e-6
 # Times evaluated at once: intermediate results then stay in the cache, which halves the time of large batches.
 _BLOCK = 4096
 
@@ -64,9 +63,7 @@ class Spline:
         bad = ~np.isfinite(points).all(axis=(1, 2))
         if bad.any():
             raise UserError(f"spline: control point {int(np.argmax(bad))} is not finite; refit the trajectory")
-        R = points[:, :3, :3]
-        bad = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2)) > _ORTHONORMAL_WITHIN
-        bad |= (np.linalg.det(R) < 0.0) | (points[:, 3] != (0.0, 0.0, 0.0, 1.0)).any(axis=1)
+        bad = ~se3.is_rigid(points)
         if bad.any():
             raise UserError(
                 f"spline: control point {int(np.argmax(bad))} is not a rigid motion; pass it through se3.orthonormalise"

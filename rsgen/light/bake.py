@@ -1,41 +1,59 @@
-"""Bake a scene's diffuse irradiance: direct light by emitter sampling, indirect light by gathering over bounces.
+"""A scene's diffuse irradiance: from the cache if it was baked with the same inputs before, else baked now and stored.
 
-1. Every point of `irradiance.Lattice` gets direct light: from each lamp (`lamps`), from the sky and off mirrors
-   (`sky`), and off lacquer and brushed metal (`caustics`). Both sides of each triangle have points; points that
-   coincide are one. Where a mesh is finer than the texel, a thinned set of points is computed and the others are
-   interpolated.
-2. Indirect light varies slowly, so it is gathered at a still thinner set, a few texels apart (`indirect`).
+1. Every point of `irradiance.Lattice` gets direct light, by emitter sampling: from each lamp (`lamps`), from the sky
+   and off mirrors (`sky`), and off lacquer and brushed metal (`specular`). Both sides of each triangle have points;
+   points that coincide are one. Where a mesh is finer than the texel, a thinned set of points is computed and the
+   others are interpolated.
+2. Indirect light varies slowly, so it is gathered over bounces at a still thinner set, a few texels apart (`indirect`).
 3. Points that no light reaches (buried in another object) are marked as not alive. Where something stands on a surface,
-   `barriers` limits how far its points count.
+   `surface_points` limits how far its points count.
 
-A point gets as many samples as the visible error of their scatter needs (`sampling`). The scatter that is left is
-smoothed where it hides any difference (`interpolation`). All randomness is a fixed low-discrepancy sequence rotated by
-a hash of the point's number: a scene bakes to the same bytes each time on one backend.
+A point gets as many samples as the visible error of their scatter needs, and the scatter that is left is smoothed
+where it hides any difference (`sampling`). All randomness is a fixed low-discrepancy sequence rotated by a hash of the
+point's number: a scene bakes to the same bytes each time on one backend.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
 import logging
 import math
+import os
+import zipfile
+import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
+from rsgen.console.configs import user_cache
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rsgen.light.caustics import caustic_light
 from rsgen.light.indirect import Surfaces, gathering, light_off_surfaces
-from rsgen.light.interpolation import Interpolation, denoised, thin
-from rsgen.light.lamps import first_look, lamp_light
-from rsgen.light.sampling import CHANNELS, GREY_SLOPE, PATCH, part_of, standard_error, typical
+from rsgen.light.lamps import first_look, lamp_light, straight_through_bulbs
+from rsgen.light.quality import estimated_quality
+from rsgen.light.sampling import (
+    CHANNELS,
+    GREY_SLOPE,
+    PATCH,
+    Interpolation,
+    denoised,
+    part_of,
+    standard_error,
+    thin,
+    typical,
+)
 from rsgen.light.sky import has_sky_light, sky_light
-from rsgen.light.specular_paths import passes_light_on
+from rsgen.light.specular import caustic_light, passes_light_on
 from rsgen.light.surface_points import sample_points
-from rsgen.render.irradiance import Lattice, lattice_area
+from rsgen.render.irradiance import IrradianceField, Lattice, lattice_area, make_lattice
 
 log = logging.getLogger("rsgen")
 
@@ -117,7 +135,7 @@ def _direct(
     alive = _reached(surfaces, fine, fine_of_point, seen, _reporter(progress, 0.55, 0.05, "finding lit surfaces"))
     if not alive.any():
         raise UserError("the scene is dark: no light reaches any surface; add an emitter or move it into the open")
-    fine, patch, means = fine[alive], _renumbered(patch[alive]), means[:, alive]
+    fine, patch, means = fine[alive], np.unique(patch[alive], return_inverse=True)[1].ravel(), means[:, alive]
     noisy = np.flatnonzero(np.hypot(left, left_of_lamps)[alive] > part)
     direct = denoised(points, fine, means, standard_error(patch, means), light.texel_m, noisy)
     return direct + off_lacquer[alive], alive
@@ -144,13 +162,95 @@ def _summed(label: IntArray, values: FloatArray) -> FloatArray:
     return np.bincount(label, values).astype(np.float64)
 
 
-def _renumbered(label: IntArray) -> IntArray:
-    return np.unique(label, return_inverse=True)[1].ravel()
-
-
 def _as_db(left: FloatArray) -> float:
     return -20 * math.log10(max(float(np.sqrt(np.mean(left**2))) * GREY_SLOPE, 1e-5))
 
 
 def _reporter(progress: Progress, begin: float, span: float, what: str) -> Callable[[float], None]:
     return lambda fraction: progress("light", begin + span * fraction, what)
+
+
+_SIDES = ("front", "back")
+
+
+def baked_field(
+    scene: Any, scene_hash: str, light: LightConfig, cache: Path, progress: Progress,
+    view: Callable[[], tuple[FloatArray, FloatArray]] | None = None,
+) -> IrradianceField:  # fmt: skip
+    """The scene's irradiance: from `cache` (a folder) if it was baked with the same inputs before, else baked now.
+
+    view: eyes and directions (n, 3) of rays along which it will be seen; with them, a new bake's quality is logged.
+    """
+    lattice = make_lattice(scene, light.texel_m)
+    key = cache_key(scene_hash, light)
+    path = cache / f"irradiance-{key}.npz"
+    stored = _load(path, lattice)
+    if stored is not None:
+        return IrradianceField(lattice, *stored)
+    with straight_through_bulbs(scene) as glass:
+        if glass:
+            log.info("lamps in bulbs: their light goes straight through %d shapes of glass", len(glass))
+        front, back = bake(scene, lattice, light, progress)
+        _store(path, front, back)
+        field = IrradianceField(lattice, front, back)
+        if view is not None:
+            progress("light", 1.0, "how right it is")
+            quality = estimated_quality(scene, field, light.texel_m, *view())
+            log.info("light baked: %s (light.target_db: %g)", quality, light.target_db)
+    return field
+
+
+def cache_key(scene_hash: str, light: LightConfig) -> str:
+    """Name of a bake: hash of the scene's files, the light's settings, this method's version and the engine's."""
+    facts = {
+        "scene": scene_hash,
+        "light": light.model_dump(exclude={"mode", "max_depth", "glossy_spp"}),
+        "method": METHOD,
+        "mitsuba": mi.__version__,
+        "variant": mi.variant(),
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def cache_folder(scene_file: Path) -> Path:
+    """Where a scene's bakes are stored: beside the scene if that is writable, else in the user's cache."""
+    if os.access(scene_file.parent, os.W_OK):
+        return scene_file.parent / ".rsgen-cache"
+    return user_cache()
+
+
+def _load(path: Path, lattice: Lattice) -> tuple[NDArray, NDArray] | None:
+    """Both sides of a stored bake, or None if there is none that fits (a damaged file is baked again)."""
+    sides = []
+    try:
+        with np.load(path) as data:
+            for side in _SIDES:
+                alive = np.unpackbits(data[f"{side}_alive"], count=lattice.points).astype(bool)
+                values = np.zeros((lattice.points, 5), np.float32)
+                values[alive, :3], values[alive, 4] = data[side], data[f"{side}_share"]
+                values[alive, 3] = 1
+                values[data[f"{side}_parted"], 3] += data[f"{side}_reach"]
+                sides.append(values)
+    except (OSError, ValueError, KeyError, EOFError, IndexError, zipfile.BadZipFile, zlib.error):
+        return None
+    return sides[0], sides[1]
+
+
+def _store(path: Path, front: NDArray, back: NDArray) -> None:
+    """Write atomically; a cache that cannot be written only costs time, so it is no error."""
+    arrays: dict[str, NDArray] = {}
+    for side, values in zip(_SIDES, (front, back), strict=True):
+        alive = values[:, 3] > 0
+        parted = np.flatnonzero(values[:, 3] > 1).astype(np.uint32)
+        arrays |= {side: values[alive, :3], f"{side}_alive": np.packbits(alive)}
+        arrays[f"{side}_share"] = values[alive, 4].astype(np.float16)
+        arrays |= {f"{side}_parted": parted, f"{side}_reach": (values[parted, 3] - 1).astype(np.uint32)}
+    temporary = path.with_suffix(f".{os.getpid()}.tmp.npz")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(temporary, allow_pickle=False, **arrays)
+        temporary.replace(path)
+    except OSError as error:
+        log.warning("light cache %s cannot be written (%s): it will be baked again next time", path, error.strerror)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)

@@ -10,27 +10,28 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.config.config import LightConfig
-from rsgen.light.interpolation import Interpolation, denoised, thin
 from rsgen.light.sampling import (
     CHANNELS,
     PATCH,
+    Interpolation,
     Sampler,
     about_normal,
+    denoised,
     part_of,
     sampled_adaptively,
     sampler_at,
     standard_error,
+    thin,
     visible_error,
 )
-from rsgen.light.specular_paths import shines, surface_radiance
+from rsgen.light.specular import shines, surface_radiance
 from rsgen.light.surface_points import SamplePoints
-from rsgen.render.irradiance import IrradianceField, Lattice, make_field
+from rsgen.render.irradiance import IrradianceField, Lattice
 
 _COARSE_TEXELS = 3.0  # light off surfaces is gathered at points about this far apart
 _BOUNCE_TEXELS = 6.0  # and by all bounces but the last, whose many rays average over what these blur
@@ -47,7 +48,7 @@ _LEAST_SHARE, _MOST_SHARE = 0.3, 1.06  # of light that gets into lacquer: at 86 
 @dataclass(frozen=True)
 class Surfaces:
     """What is baked: a scene's lattice, its unique points, (2, points) which of them each lattice point's front and
-    back is, how far these count (see `barriers.Barriers`), and whether light is followed through panes.
+    back is, how far these count (see `sample_points`), and whether light is followed through panes.
     """
 
     scene: Any
@@ -59,10 +60,10 @@ class Surfaces:
 
     def field(self, values: NDArray, alive: NDArray[np.bool_]) -> IrradianceField:
         """Irradiance (n, 4), see `in_channels`, of the unique points, as far as they are alive (n,)."""
-        return make_field(self.lattice, *self.sides(values, alive))
+        return IrradianceField(self.lattice, *self.sides(values, alive))
 
     def sides(self, values: NDArray, alive: NDArray[np.bool_]) -> tuple[Float32Array, Float32Array]:
-        """The same as (points, 5) of the lattice's front and back, as `make_field` takes it."""
+        """The same as (points, 5) of the lattice's front and back, as `IrradianceField` takes it."""
         # In half precision, as it is kept: light from the cache must be the same to the last bit.
         share = values[:, 3] / np.maximum(values[:, :3].mean(axis=1), 1e-30)
         share = share.clip(_LEAST_SHARE, _MOST_SHARE).astype(np.float16).astype(np.float32)
@@ -86,7 +87,7 @@ def gathering(scene: Any, field: IrradianceField, points: SamplePoints, which: I
         p, n, number = at
 
         def light_along(ray: Any, i: Any, pick: Any) -> Any:
-            return surface_radiance(scene, field, ray, number, i, pick, follow, mi.Bool(True))
+            return surface_radiance(scene, field, ray, number, i, pick, follow)
 
         return about_normal(p, n, number, begin, count, 101, light_along)
 

@@ -26,13 +26,15 @@ from rsgen.light.sampling import (
     CHANNELS,
     about_normal,
     in_channels,
+    in_halves,
+    interaction,
     part_of,
     r2,
     rotation,
     sampled_adaptively,
     sampler_at,
 )
-from rsgen.light.specular_paths import first_scatterer, transmitted
+from rsgen.light.specular import first_scatterer, transmitted
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import registry_id
 from rsgen.scene.rays import RAY_OFFSET_M
@@ -143,52 +145,42 @@ def _kinds(scene: Any) -> list[tuple[Any, int, bool]]:
     return [(lamp, k, int(lamp.flags()) & int(mi.EmitterFlags.Delta) != 0) for k, lamp in enumerate(lamps)]
 
 
-def _registry_id(emitter: Any) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
-
-
 def _draw(scene: Any, emitter: Any, dimension: int, points: SamplePoints, which: IntArray, follow: bool) -> Any:
     def sample(at: Sequence[Any], _: IntArray, begin: int, count: int) -> Any:
-        return _from_emitter(scene, emitter, *at, begin, count, dimension, follow)
+        p, n, number = at
+        return _from_emitter(scene, emitter, p, n, number, begin, count, dimension, follow)
 
     return sampler_at(points, which, sample)
 
 
-@dr.syntax
-def _from_emitter(scene, emitter, p, n, number, begin, samples, dimension, follow):
+def _from_emitter(
+    scene: Any, emitter: Any, p: Any, n: Any, number: Any, begin: int, samples: int, dimension: int, follow: bool
+) -> tuple[Any, Any]:
     """Sums over two halves of the samples `begin` to `begin + samples` of irradiance at p (normal n) from one emitter.
 
     If that is None, from random ones but the sky.
     """
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    it.t = mi.Float(1)
-    it.n = mi.Normal3f(n)
+    it = interaction(p, n)
     offset = mi.Point2f(rotation(number, 2 * dimension), rotation(number, 2 * dimension + 1))
     # Not part of the program: what is compiled for one lamp serves for all.
-    lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else _registry_id(emitter)))
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, samples)
-    even, odd = mi.Vector4f(0), mi.Vector4f(0)
-    while i < end:
+    lamp = dr.reinterpret_array(mi.EmitterPtr, dr.opaque(mi.UInt32, 0 if emitter is None else registry_id(emitter)))
+
+    def light(i: Any) -> Any:
         u = r2(i, offset)
-        if dr.hint(emitter is None, mode="scalar"):
+        if emitter is None:
             ds, value = scene.sample_emitter_direction(it, u, False)
-            if dr.hint(scene.environment() is not None, mode="scalar"):
+            if scene.environment() is not None:
                 value = dr.select(ds.emitter == mi.EmitterPtr(scene.environment()), 0, value)
         else:
             ds, value = lamp.sample_direction(it, u)
         cosine = dr.dot(n, ds.d)
         lit = (cosine > 0) & (ds.pdf > 0) & (dr.max(value) > 0)
         arrives = transmitted(scene, p, ds.d, ds.dist, lit, follow)
-        light = value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine))
+        brought = value * cosine * dr.select(ds.delta, 1, _light_share(ds.pdf, cosine))
         # What misses a lamp with a picture has no direction: a cosine that is NaN would be in the sum, times 0.
-        light = in_channels(dr.select(lit, light * arrives, 0), dr.select(lit, cosine, 0))
-        first = (i & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return even, odd
+        return in_channels(dr.select(lit, brought * arrives, 0), dr.select(lit, cosine, 0))
+
+    return in_halves(begin, samples, light)
 
 
 def _light_share(light_pdf: Any, cosine: Any) -> Any:
@@ -200,9 +192,7 @@ def _light_share(light_pdf: Any, cosine: Any) -> Any:
 
 def left_to_rays(scene: Any, p: Any, n: Any, follow: bool) -> Callable[[Any, Any, Any], Any]:
     """What rays from p about n bring of the light that `_from_emitter` leaves to them (see `about_normal`)."""
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
-    it.n = mi.Normal3f(n)
+    it = interaction(p, n)
     any_lamp = len(scene.emitters()) > MANY_EMITTERS
 
     def light_along(ray: Any, _: Any, pick: Any) -> Any:

@@ -15,8 +15,8 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
-from rsgen.light.sampling import r2
-from rsgen.light.specular_paths import first_scatterer, passes_light_on, transmitted
+from rsgen.light.sampling import golden, r2
+from rsgen.light.specular import first_scatterer, passes_light_on, transmitted
 from rsgen.render.irradiance import IrradianceField
 from rsgen.scene.moving_objects import HARMONICS, harmonics, irradiance_coefficients
 
@@ -43,12 +43,9 @@ def _gathered(scene: Any, field: IrradianceField, p_world: FloatArray, follow: b
 def _from_surfaces(scene: Any, field: IrradianceField, p_world: FloatArray, follow: bool) -> FloatArray:
     index = dr.arange(mi.UInt32, len(p_world) * _RAYS)
     i = index % _RAYS
-    u = r2(i, mi.Point2f(0.5))
-    d = mi.warp.square_to_uniform_sphere(u)
-    pick = mi.Float(i) * 0.6180339887498949
-    pick -= dr.floor(pick)
+    d = mi.warp.square_to_uniform_sphere(r2(i, mi.Point2f(0.5)))
     ray = mi.Ray3f(_places(p_world, index // _RAYS), d)
-    pi, si, ray, through, turned = first_scatterer(scene, ray, pick, follow, mi.Bool(True))
+    pi, si, ray, through, turned = first_scatterer(scene, ray, golden(i, 0), follow, mi.Bool(True))
     hit = si.is_valid()
     emitter = si.emitter(scene)
     lamp = (emitter != dr.zeros(mi.EmitterPtr)) & turned  # the others are sampled

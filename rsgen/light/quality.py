@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from rsgen import srgb
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.device.arrays import rows_of
-from rsgen.light.caustics import gathered_caustics
 from rsgen.light.indirect import gathering
 from rsgen.light.lamps import lamp_light
 from rsgen.light.sampling import typical
 from rsgen.light.sky import LESS, has_sky_light, sky_light
-from rsgen.light.specular_paths import first_scatterer, passes_light_on, shines
+from rsgen.light.specular import first_scatterer, gathered_caustics, passes_light_on, shines
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.irradiance import IrradianceField
 from rsgen.scene.rays import rays_from
@@ -31,8 +30,6 @@ from rsgen.scene.rays import rays_from
 _GREY = 0.18  # reflectance of the surface that is looked at, where light is typical
 # Samples of each lamp, the sky and surfaces: their scatter must not hide the errors that are looked for.
 _LAMP_SAMPLES, _SKY_SAMPLES, _RAYS = 16 * 512, 4096, 512
-_LEAST_ERROR = 1e-6
-_SURE = 2.0  # standard errors
 
 
 @dataclass(frozen=True)
@@ -65,14 +62,7 @@ def estimated_quality(
     if exposed <= 0:
         return Quality(math.inf, math.inf)
     one, other, ours = (srgb.encode(np.clip(_GREY / exposed * e, 0, 1)) for e in (*halves, baked))
-    # Of two errors that share nothing but the baked light's own, so that what is computed may scatter.
-    square = ((ours - one) * (ours - other)).mean(axis=1)
-    error, unsure = float(square.mean()), float(square.std() / math.sqrt(len(square)))
-    return Quality(_db(error), _db(max(error, 0.0) + _SURE * unsure))
-
-
-def _db(square: float) -> float:
-    return -10 * math.log10(max(square, _LEAST_ERROR))
+    return Quality(*srgb.psnr_without_noise((ours, ours), (one, other)))  # what is computed may scatter
 
 
 def _seen(

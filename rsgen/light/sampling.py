@@ -1,21 +1,24 @@
-"""Sampling at surface points: random numbers that are the same each time, and adaptive numbers of samples.
+"""Estimates of light at surface points: drawn until their scatter is out of sight, then smoothed and interpolated.
 
-Each point gets as many samples as what their scatter shows needs, and no more.
+Random numbers are the same each time. Each point gets as many samples as what their scatter shows needs, and no more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.surface_points import SamplePoints
+from rsgen.light.surface_points import SamplePoints, in_order, row_hash
 
 CHANNELS = 4  # of light: see `in_channels`
 _ETA = 1.5  # of lacquer
@@ -47,9 +50,38 @@ def r2(i: Any, offset: Any) -> Any:
     return mi.Point2f(x - dr.floor(x), y - dr.floor(y))
 
 
+def golden(i: Any, offset: Any) -> Any:
+    """Number i of the sequence in [0, 1) that goes by the golden ratio from `offset` on."""
+    x = offset + mi.Float(i) * 0.6180339887498949
+    return x - dr.floor(x)
+
+
+def interaction(p: Any, n: Any) -> Any:
+    """Interaction3f at points p of normal n."""
+    it = dr.zeros(mi.Interaction3f, dr.width(p))
+    it.p, it.t, it.n = p, mi.Float(1), mi.Normal3f(n)
+    return it
+
+
 @dr.syntax
-def about_normal(p, n, number, begin, count, dimension, light_along):
-    """Sums (Vector4f) over two halves of the cosine-distributed rays `begin` to `begin + count` from p about n.
+def in_halves(begin, count, light, bit=1):
+    """Sums (Vector4f) over two halves of the samples light(i), i from `begin` to `begin + count`, by a bit of i."""
+    i = dr.opaque(mi.UInt32, begin)
+    end = i + dr.opaque(mi.UInt32, count)
+    even, odd = mi.Vector4f(0), mi.Vector4f(0)
+    while i < end:
+        sample = light(i)
+        first = (i & bit) == 0
+        even += dr.select(first, sample, 0)
+        odd += dr.select(first, 0, sample)
+        i += 1
+    return even, odd
+
+
+def about_normal(
+    p: Any, n: Any, number: Any, begin: int, count: int, dimension: int, light_along: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, Any]:
+    """Sums over two halves of the cosine-distributed rays `begin` to `begin + count` from p about n.
 
     dimension: the first of three for random numbers (see `rotation`). light_along: of (ray, its number i, a uniform
     number for lots) π times the radiance that comes along it: with pdf cosθ/π, ∫ L cosθ dω is the mean of πL.
@@ -57,19 +89,12 @@ def about_normal(p, n, number, begin, count, dimension, light_along):
     frame = mi.Frame3f(n)
     offset = mi.Point2f(rotation(number, dimension), rotation(number, dimension + 1))
     lobe = rotation(number, dimension + 2)
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, count)
-    even, odd = mi.Vector4f(0), mi.Vector4f(0)
-    while i < end:
+
+    def light(i: Any) -> Any:
         d = mi.warp.square_to_cosine_hemisphere(r2(i, offset))
-        pick = lobe + mi.Float(i) * 0.6180339887498949
-        pick -= dr.floor(pick)
-        light = in_channels(light_along(mi.Ray3f(p, frame.to_world(d)), i, pick), d.z)
-        first = (i & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return even, odd
+        return in_channels(light_along(mi.Ray3f(p, frame.to_world(d)), i, golden(i, lobe)), d.z)
+
+    return in_halves(begin, count, light)
 
 
 def shaded_nearby(scene: Any, points: SamplePoints, which: NDArray, within_m: float, rays: int) -> FloatArray:
@@ -205,3 +230,117 @@ def sampler_at(points: SamplePoints, which: IntArray, sample: Callable[..., Any]
         return out
 
     return draw
+
+
+_NEIGHBOURS = 8
+_SMOOTHING = 0.3  # spacings: closer sources than this count alike
+_STEP, _BEYOND = 0.15, 1e-3  # spacings: of a step in a surface; what is beyond one counts for so little
+_INTERPOLATED_AT_ONCE = 1 << 18
+_DENOISED_OVER = 32
+_DENOISING_REACH = 2.0  # spacings: of the weight's fall with distance
+_DENOISING_CHUNK = 1 << 17
+
+
+def thin(
+    points: SamplePoints, spacing: float, among: IntArray | None = None, steps: bool = False
+) -> tuple[IntArray, IntArray]:
+    """Of `among` (default: all), one in each cell of `spacing` metres, of like normals on one piece of surface.
+
+    steps: none stands for what is a step above or below it, as the bottom of a groove is. Returns the chosen ones as
+    indices into `among`, and for each of `among` which of the chosen stands for it.
+    """
+    position, normal, piece = points.position, points.normal, points.piece
+    if among is not None:
+        position, normal, piece = position[among], normal[among], piece[among]
+    cell = np.floor(position / spacing)
+    off_centre = ((position / spacing - cell - 0.5) ** 2).sum(axis=1)
+    # A buried face must not stand for a lit one just in front of it, so pieces of surface are kept apart.
+    facing = np.round(normal)
+    key = row_hash(*cell.T, *facing.T, piece)
+    if steps:
+        above = np.einsum("ij,ij->i", position / spacing - cell, facing / np.linalg.norm(facing, axis=1, keepdims=True))
+        key = row_hash(key.view(np.int64), np.floor(above / _STEP).astype(np.int64))
+    del cell
+    order = np.lexsort((off_centre, key))
+    sorted_key = key[order]
+    starts = np.concatenate([[True], sorted_key[1:] != sorted_key[:-1]])
+    chosen, rank = in_order(order[starts])
+    stands_for = np.empty(len(order), np.int64)
+    stands_for[order] = rank[np.cumsum(starts) - 1]
+    return chosen, stands_for
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """Values at some points from those at `sources`: neighbours (n, k) among the sources and weights (n, k)."""
+
+    neighbours: NDArray[np.int32]
+    weights: Float32Array
+
+    @classmethod
+    def between(cls, points: SamplePoints, sources: NDArray, targets: NDArray, spacing: float) -> Interpolation:
+        """By distance in position (in units of `spacing` metres) and normal together, within one piece of surface.
+
+        The dark inside of a thin sheet is a millimetre from its lit outside and has the normal of the other outside.
+        """
+        k = min(_NEIGHBOURS, len(sources))
+        tree = cKDTree(points.coordinates(spacing, sources))
+        near, weights = np.empty((len(targets), k), np.int32), np.empty((len(targets), k), np.float32)
+        for begin in range(0, len(targets), _INTERPOLATED_AT_ONCE):
+            part = slice(begin, begin + _INTERPOLATED_AT_ONCE)
+            found = tree.query(points.coordinates(spacing, targets[part]), k=k, workers=-1, eps=0.2)
+            distance, near[part] = (np.reshape(v, (-1, k)) for v in found)
+            # Falls to zero at the furthest neighbour, so that the interpolant is continuous as neighbours change, and
+            # grows without bound towards a source, so that it passes through the sources.
+            falling = np.clip(1 - (distance / (distance[:, -1:] * 1.0001 + 1e-9)) ** 2, 0, 1) ** 2
+            weight = (falling + 1e-6) / (distance**2 + _SMOOTHING**2)
+            apart = points.position[sources[near[part]]] - points.position[targets[part], None]
+            step = np.einsum("nki,ni->nk", apart, points.normal[targets[part]]) / (_STEP * spacing)
+            weight *= np.exp(-(step**2)) + _BEYOND
+            weights[part] = weight / weight.sum(axis=1, keepdims=True)
+        return cls(near, weights)
+
+    def __call__(self, at_sources: Float32Array) -> Float32Array:
+        n, k = self.neighbours.shape
+        rows = np.arange(0, n * k + 1, k)
+        flat = self.weights.ravel(), self.neighbours.ravel(), rows
+        return np.asarray(csr_array(flat, shape=(n, len(at_sources))) @ at_sources.astype(np.float32, copy=False))
+
+    def spread(self, at_sources: FloatArray) -> FloatArray:
+        """Standard deviation (n,), by their weights, of the values (m,) that each one is interpolated from."""
+        mean, square = np.zeros((2, len(self.neighbours)))
+        for weight, near in zip(self.weights.T, self.neighbours.T, strict=True):
+            mean += weight * at_sources[near]
+            square += weight * at_sources[near] ** 2
+        return np.sqrt(np.maximum(square - mean**2, 0.0))
+
+
+def denoised(
+    points: SamplePoints, which: IntArray, halves: NDArray, sigma: FloatArray, spacing: float, noisy: IntArray
+) -> Float32Array:
+    """Mean (n, 4) of two independent estimates (2, n, 4) of irradiance, smoothed where noise hides any difference.
+
+    sigma: standard error (n,) of the mean, in grey. noisy: which of the points are looked at, the others stay.
+    Each half is averaged with weights by the other (Rousselle, Manzi, Zwicker, PG 2013), so that noise does not choose
+    what it is averaged with: edges of shadows stay.
+    """
+    out = halves.mean(axis=0).astype(np.float32)
+    if not len(noisy):
+        return out
+    scaled = points.coordinates(_DENOISING_REACH * spacing, which)
+    grey = halves.mean(axis=2)
+    # Variance of one half: of a point that scatters more than its neighbours its own.
+    half = np.maximum(2.0 * sigma**2, 0.5 * (grey[0] - grey[1]) ** 2)
+    tree = cKDTree(scaled)
+    k = min(_DENOISED_OVER, len(which))
+    for begin in range(0, len(noisy), _DENOISING_CHUNK):
+        part = noisy[begin : begin + _DENOISING_CHUNK]
+        distance, near = (np.reshape(v, (-1, k)) for v in tree.query(scaled[part], k=k, workers=-1))
+        spread = half[part, None] + half[near]
+        smoothed = np.zeros((len(near), halves.shape[2]))
+        for one, other in ((0, 1), (1, 0)):
+            apart = (grey[other][part, None] - grey[other][near]) ** 2 - spread
+            weight = np.exp(-0.5 * distance**2 - np.maximum(apart, 0) / np.maximum(spread, 1e-20))
+            smoothed += np.einsum("nk,nkc->nc", weight, halves[one][near]) / (2 * weight.sum(axis=1, keepdims=True))
+        out[part] = smoothed
+    return out

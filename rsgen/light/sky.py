@@ -16,9 +16,19 @@ import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray, IntArray
 from rsgen.device.arrays import aligned
-from rsgen.light.interpolation import thin
-from rsgen.light.sampling import chunks, in_channels, r2, rotation, sampled_adaptively, sampler_at
-from rsgen.light.specular_paths import first_scatterer, passes_light_on
+from rsgen.light.sampling import (
+    chunks,
+    golden,
+    in_channels,
+    in_halves,
+    interaction,
+    r2,
+    rotation,
+    sampled_adaptively,
+    sampler_at,
+    thin,
+)
+from rsgen.light.specular import first_scatterer, passes_light_on
 from rsgen.light.surface_points import SamplePoints
 
 _CELL_M = 0.5  # parts of the scene that have one histogram, of like normals on one piece of surface
@@ -55,7 +65,8 @@ def sky_light(
     guide = _learned(scene, points, which, cell, texel_m, follow)
 
     def sample(at: Sequence[Any], here: IntArray, begin: int, count: int) -> Any:
-        return _sky_at(scene, guide, mi.UInt32(aligned(cell[here], np.uint32)), *at, begin, count, follow)
+        p, n, number = at
+        return _sky_at(scene, guide, mi.UInt32(aligned(cell[here], np.uint32)), p, n, number, begin, count, follow)
 
     draw = sampler_at(points, which, sample)
     first, rounds = max(4, samples // LESS), _ROUNDS_OF_LAMPS if scene.environment() is None else _ROUNDS
@@ -73,7 +84,7 @@ def _learned(
         here = cell[coarse[first : first + len(part)]]
         bins = np.repeat(here * BINS, _FIRST_LOOK_SAMPLES) + np.array(found[0])
         np.add.at(seen.reshape(-1), bins, np.array(found[1]))  # much faster by one index than by two
-    return Guide.learned(seen)
+    return Guide(seen)
 
 
 def _first_look(scene: Any, p: Any, n: Any, number: Any, follow: bool) -> tuple[Any, Any]:
@@ -97,8 +108,7 @@ def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, guided: Any) -> tuple
     """
     about = mi.Frame3f(n).to_world(mi.warp.square_to_cosine_hemisphere(u))
     own, sky = about, scene.environment()
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p, it.t, it.n = p, mi.Float(1), mi.Normal3f(n)
+    it = interaction(p, n)
     if sky is not None:
         own = sky.sample_direction(it, u)[0].d
     d = dr.select(other, about if guided is None else guided[0], own)
@@ -113,49 +123,40 @@ def _drawn(scene: Any, p: Any, n: Any, u: Any, other: Any, guided: Any) -> tuple
 def _arriving(scene: Any, p: Any, n: Any, d: Any, pick: Any, follow: bool) -> tuple[Any, Any]:
     """Whether anything arrives at p (normal n) from direction d, and radiance times cosine."""
     cosine = dr.dot(n, d)
-    _, si, _, through, turned = first_scatterer(scene, mi.Ray3f(p, d), pick - dr.floor(pick), follow, cosine > 0)
+    _, si, _, through, turned = first_scatterer(scene, mi.Ray3f(p, d), pick, follow, cosine > 0)
     emitter = si.emitter(scene)
     found = (cosine > 0) & (emitter != dr.zeros(mi.EmitterPtr)) & (~si.is_valid() | turned)
     return found, dr.select(found, through * emitter.eval(si, found) * cosine, 0)
 
 
-@dr.syntax
-def _sky_at(scene, guide, cell, p, n, number, begin, samples, follow):
+def _sky_at(
+    scene: Any, guide: Guide, cell: Any, p: Any, n: Any, number: Any, begin: int, samples: int, follow: bool
+) -> tuple[Any, Any]:
     """Sums over two halves of the samples `begin` to `begin + samples`."""
     offset = mi.Point2f(rotation(number, 204), rotation(number, 205))
     lobe = rotation(number, 206)
-    i = dr.opaque(mi.UInt32, begin)
-    end = i + dr.opaque(mi.UInt32, samples)
-    even, odd = mi.Vector4f(0), mi.Vector4f(0)
-    while i < end:
+
+    def light(i: Any) -> Any:
         u = r2(i >> 1, offset)
         guided = (guide.sample(cell, u), lambda d: guide.density(cell, d))
         d, density = _drawn(scene, p, n, u, (i & 1) == 1, guided)
-        found, light = _arriving(scene, p, n, d, lobe + mi.Float(i) * 0.6180339887498949, follow)
-        light = dr.select(found & (density > 0), light / dr.maximum(density, 1e-20), 0)
-        light = in_channels(light, dr.dot(n, d))
-        first = ((i >> 1) & 1) == 0
-        even += dr.select(first, light, 0)
-        odd += dr.select(first, 0, light)
-        i += 1
-    return even, odd
+        found, brought = _arriving(scene, p, n, d, golden(i, lobe), follow)
+        return in_channels(dr.select(found & (density > 0), brought / dr.maximum(density, 1e-20), 0), dr.dot(n, d))
+
+    return in_halves(begin, samples, light, bit=2)  # of each two one is the sky's own and one guided
 
 
 class Guide:
     """Densities of directions for each cell; no dataclass, which Dr.Jit's loops would take apart as their state."""
 
-    def __init__(self, cumulative: Any) -> None:
-        """cumulative: Float, for each cell its bins' distribution function, the last being 1."""
-        self.cumulative = cumulative
-
-    @classmethod
-    def learned(cls, seen: Float32Array) -> Guide:
-        """From the light (cells, BINS) that samples, drawn evenly, have brought from each bin."""
+    def __init__(self, seen: Float32Array) -> None:
+        """Learned from the light (cells, BINS) that samples, drawn evenly, have brought from each bin."""
         cumulative = np.empty_like(seen)
         for begin in range(0, len(seen), _GUIDE_CHUNK):
             part = slice(begin, begin + _GUIDE_CHUNK)
             cumulative[part] = _distribution(seen[part].reshape(-1, _ALONG, _AROUND).astype(np.float64))
-        return cls(mi.Float(aligned(cumulative)))
+        # Of each cell its bins' distribution function, the last being 1.
+        self.cumulative = mi.Float(aligned(cumulative))
 
     def sample(self, cell: Any, u: Any) -> Any:
         """A direction (Vector3f, world frame) in each cell, by two uniform numbers."""

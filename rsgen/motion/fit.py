@@ -119,7 +119,8 @@ def fit_spline(
     for iteration in range(1, _MAX_ITERATIONS + 1):
         if iteration <= _SCALE_ITERATIONS:
             # Least squares first: the start is poor at the ends, and Huber would take its poses there for outliers.
-            threshold = _huber_threshold(r) if robust == "huber" and iteration > 2 else math.inf
+            typical = float(np.median(np.linalg.norm(r, axis=1)))
+            threshold = max(HUBER_FACTOR * typical, 1e-6) if robust == "huber" and iteration > 2 else math.inf
             prior = smooth + _prior(r, bend, loose)
         bands, gradient = _data_equations(trajectory, spline, r, threshold, scale, _RADIAL if length == 1.0 else 0.0)
         prior_bands, prior_gradient = _prior_equations(spline, bend, prior, scale)
@@ -220,10 +221,6 @@ def _cost(r: FloatArray, bend: FloatArray, threshold: float, prior: FloatArray) 
 
 
 # --- weights ---------------------------------------------------------------------------------------------------------
-
-
-def _huber_threshold(r: FloatArray) -> float:
-    return max(HUBER_FACTOR * float(np.median(np.linalg.norm(r, axis=1))), 1e-6)
 
 
 def _huber_weights(norm: FloatArray, threshold: float) -> FloatArray:

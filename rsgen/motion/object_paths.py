@@ -14,9 +14,9 @@ from rsgen.config.motion import ObjectConfig, ObjectMotionConfig, Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
-from rsgen.motion.clearance import nearest_surface
 from rsgen.motion.fit import fit_spline
-from rsgen.motion.paths import TourCurve
+from rsgen.motion.free_space import nearest_surface
+from rsgen.motion.make import TourCurve
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
 _RATE_HZ = 200.0

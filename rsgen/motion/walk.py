@@ -10,7 +10,7 @@ from skimage.graph import MCP_Geometric
 from skimage.measure import find_contours
 
 from rsgen.array_types import BoolArray, FloatArray
-from rsgen.motion.floor_plan import BOB_M, Cast, FloorPlan
+from rsgen.motion.free_space import BOB_M, Cast, FloorPlan
 
 _SLACK_M = 0.04  # hand-shake, and the curve between waypoints, need so much more than the clearance
 _DISTANCES_M = (1.2, 1.0, 0.8, 0.65, 0.5)
@@ -186,12 +186,12 @@ def choose_targets(
     azimuth = _closed_way(best, calm)
     chosen = worth[np.arange(len(worth)), azimuth]
     pitch = np.radians(np.take(_PITCHES_DEG, chosen.argmax(axis=1)))
-    target = p_world + _TARGET_M * _direction(azimuth * (math.tau / AZIMUTHS), pitch)
+    target = p_world + _TARGET_M * unit_directions(azimuth * (math.tau / AZIMUTHS), pitch)
     first = int(np.minimum(chosen.max(axis=1), np.roll(chosen.max(axis=1), -1)).argmax())
     return np.roll(p_world, -first, axis=0), np.roll(target, -first, axis=0)
 
 
-def _direction(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
+def unit_directions(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
     """Unit directions (..., 3), world, y up."""
     level = np.cos(elevation)
     return np.stack([level * np.cos(azimuth), np.sin(elevation), level * np.sin(azimuth)], axis=-1)
@@ -200,7 +200,7 @@ def _direction(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
 def _views(p_world: FloatArray, cast: Cast, color: FloatArray | None = None) -> FloatArray:
     """Worth (n, azimuths, pitches) of a view from each place in each direction. color: as in `choose_targets`."""
     azimuth, elevation = np.arange(AZIMUTHS) * (math.tau / AZIMUTHS), np.radians(ELEVATIONS_DEG)
-    rays = _direction(*np.meshgrid(azimuth, elevation, indexing="ij")).reshape(-1, 3)
+    rays = unit_directions(*np.meshgrid(azimuth, elevation, indexing="ij")).reshape(-1, 3)
     distance, normal = cast(np.repeat(p_world, len(rays), axis=0), np.tile(rays, (len(p_world), 1)))
     shape = (len(p_world), AZIMUTHS, len(elevation))
     worth = np.where(np.isfinite(distance), np.interp(distance, _DISTANCE_M, _WORTH), _NOTHING).reshape(shape)

@@ -8,10 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 
-from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
-from rsgen.geometry.spline import Spline
-from rsgen.motion.stretch import Drawn, Ranges, along
+from rsgen.motion.stretch import Ranges
 
 Layout = Literal["carla-rs", "fastec-rs"]
 LAYOUTS: tuple[str, ...] = get_args(Layout)
@@ -71,8 +69,3 @@ class PackOptions:
     def sequences(self) -> int:
         """How many the count takes."""
         return -(-self.count // self.length)
-
-
-def camera_spline(spline: Spline, drawn: Drawn, T_depth_color: FloatArray) -> Spline:
-    """T_world_cam(t) of a sequence's colour camera, with stamp 0 first, from the config's T_world_depth(t)."""
-    return along(spline, drawn.start_s, drawn.speed, drawn.turn, T_depth_color)

@@ -26,7 +26,7 @@ from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.geometry.camera import Camera
 from rsgen.limits import MOST_M
-from rsgen.motion.paths import look_at
+from rsgen.motion.make import look_at
 from rsgen.scene.meshes import ply_bytes, vertex_normals
 from rsgen.sensors.color import to_srgb8
 

@@ -1,11 +1,12 @@
-"""Frames of one camera on demand: rendered, then seen through the sensor's noise.
+"""Frames of all cameras on demand: rendered, then seen through their sensors' noise, and written in order.
 
 Exposing a frame uses the renderer and belongs into one thread; developing it is NumPy only and may run beside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,19 +15,23 @@ from numpy.typing import NDArray
 
 from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray, UInt16Array
 from rsgen.config.cameras import ColorConfig, DepthConfig
+from rsgen.config.config import Config
 from rsgen.config.rig import RigColorConfig, RigDepthConfig
 from rsgen.config.sections import TruthConfig
+from rsgen.console.progress import Progress
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
+from rsgen.produce.writer import SequenceWriter
 from rsgen.sensors.color import Meter, Reading, Setting, apply_color_noise, apply_setting, reading, to_srgb8
-from rsgen.sensors.depth import apply_depth_noise, mixed_depth, register_depth, with_fixed_errors
+from rsgen.sensors.depth import apply_depth_noise, mixed_depth, register_depth, stereo_depth, with_fixed_errors
 from rsgen.sensors.seed import device_seed, frame_seed, noise_generator
-from rsgen.sensors.stereo import stereo_depth
 from rsgen.sequence.format import CLEAN_COLOR
 from rsgen.sequence.truth_files import FrameTable
 
+# Written frames that may wait for the disk: bounds memory and how much a kill can lose.
+_WRITE_AHEAD = 4
 # Light meters of cameras see no more than this of a picture.
 _METER_WIDTH, _METER_SPP = 64, 4
 # Luminance of linear RGB (ITU-R BT.709): what a camera without colours sees of visible light.
@@ -102,7 +107,7 @@ class ColorSource:
         self._truth = TruthRenderer(stage.scene, stage.integrator, config, truth, *seen) if wanted else None
         self._dots = None
         if isinstance(config, RigColorConfig) and config.dots is not None:
-            from rsgen.sensors.dots import DotProjector
+            from rsgen.sensors.projectors import DotProjector
 
             self._dots = DotProjector(stage.scene, config.camera, shutter, config.dots, stage.seed)
 
@@ -194,7 +199,7 @@ class DepthSource:
         registered_to: tuple[Camera, FloatArray] | None = None,
     ) -> None:  # fmt: skip
         from rsgen.render import images as render
-        from rsgen.sensors.shadow import Projector
+        from rsgen.sensors.projectors import Projector
 
         self._stage, self._name, self.config, self._registered_to = stage, name, config, registered_to
         self._T_body_cam = None if (T_cam_body == np.eye(4)).all() else se3.inverse(T_cam_body)
@@ -264,3 +269,66 @@ def small_camera(camera: Camera, width: int) -> Camera:
     x, y = columns / camera.width, rows / camera.height
     cx, cy = (camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5
     return replace(camera, width=columns, height=rows, fx=camera.fx * x, fy=camera.fy * y, cx=cx, cy=cy)
+
+
+class FrameSource:
+    """Cameras by name, of which frames are rendered on demand; `rsgen.produce.parts.open_frames` makes one."""
+
+    def __init__(self, stage: Stage, config: Config) -> None:
+        """config: of the cameras; its scene is the stage's already."""
+        self._of_view = config.view
+        self.colors = {
+            name: ColorSource(stage, name, stream, config.T_cam_body(name), config.truth)
+            for name, stream in config.cameras.items()
+            if isinstance(stream, ColorConfig)
+        }
+        into = (config.color.camera, np.asarray(config.T_color_depth, float)) if config.depth.registered else None
+        self.depths = {
+            name: DepthSource(stage, name, stream, config.T_cam_body(name), self.colors, into)
+            for name, stream in config.cameras.items()
+            if isinstance(stream, DepthConfig)
+        }
+
+    @property
+    def color(self) -> ColorSource:
+        """The colour camera: of a rig the first one."""
+        return self.colors[self._of_view]
+
+    @property
+    def depth(self) -> DepthSource:
+        """The depth camera: of a rig the first one."""
+        return next(iter(self.depths.values()))
+
+
+def render_shots(
+    writer: SequenceWriter, source: FrameSource, shots: Sequence[tuple[int, str]], progress: Progress
+) -> None:
+    """Render images (frame, stream) in order and write them; noise and encoding go on beside. Raises UserError."""
+    # However this ends, leaving the pool waits for what has been rendered to be written.
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        pending: list[Future[None]] = []
+        for done, (k, stream) in enumerate(shots, 1):
+            shown = writer.shows(stream, k)
+            stamp = float(writer.stamps(stream)[shown])
+            if stream in source.colors:
+                after = writer.next_shown(stream, k)
+                next_stamp = None if after is None else float(writer.stamps(stream)[after])
+                settings = (None if frame is None else writer.setting(stream, frame) for frame in (shown, after))
+                shot = source.colors[stream].expose(writer.spline, stamp, shown, next_stamp, *settings)
+                pending.append(pool.submit(_write_color, writer, source.colors[stream], stream, k, shot))
+            else:
+                measured = source.depths[stream].expose(writer.spline, stamp, shown)
+                pending.append(pool.submit(_write_depth, writer, source.depths[stream], stream, k, measured))
+            while len(pending) > _WRITE_AHEAD:
+                pending.pop(0).result()
+            progress("frames", done / len(shots), f"frame {k}")
+        for write in pending:
+            write.result()
+
+
+def _write_color(writer: SequenceWriter, source: ColorSource, stream: str, k: int, shot: ColorShot) -> None:
+    writer.write_color(k, *source.develop(shot), stream=stream)
+
+
+def _write_depth(writer: SequenceWriter, source: DepthSource, stream: str, k: int, shot: DepthShot) -> None:
+    writer.write_depth(k, shot.z, source.develop(shot), shot.ids, stream=stream, labels=shot.labels)

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,37 @@ from rsgen.config.config import load_config
 from rsgen.config.sections import LightConfig
 from rsgen.console.configs import configs_folder
 from rsgen.console.tables import Table
+from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.files import parse_yaml
+from rsgen.motion.free_space import find_floors
+from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.meshes import surface
 
 _SHORT = 110  # characters of what a scene or a config is
 _PLY_TYPES = {
     b"char": "i1", b"uchar": "u1", b"short": "<i2", b"ushort": "<u2", b"int": "<i4", b"uint": "<u4", b"float": "<f4",
     b"double": "<f8",
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a built scene is made of. size: (3,) m, of its box; lit: how many of the settings of light are baked."""
+
+    triangles: int
+    size: tuple[float, float, float]
+    materials: tuple[str, ...]
+    lit: tuple[int, int]
+
+    def text(self) -> str:
+        """In one line."""
+        lit, settings = self.lit
+        x, y, z = self.size
+        light = f"light baked for {lit} of {settings} settings"
+        if lit in (0, settings):
+            light = "light baked" if lit == settings else "light not baked yet"
+        return f"{x:.1f} x {y:.1f} x {z:.1f} m, {self.triangles:,} triangles, {light}"
 
 
 @dataclass(frozen=True)
@@ -57,29 +80,49 @@ class ShippedScene:
         """The command that builds another such scene, or that there is none."""
         return f"rsgen scenes {self.name} --seed N --out DIR" if self.takes_seed else "takes no seed"
 
+    @cached_property
+    def contents(self) -> Contents | None:
+        """What its file and the meshes that it names hold; None: it is not built. Raises UserError if it is damaged."""
+        if not self.file.is_file():
+            return None
+        try:
+            meshes, materials = _named(self.file)
+            counted = [_ply_box(mesh) for mesh in meshes]
+        except (OSError, ET.ParseError, KeyError, ValueError, IndexError) as error:
+            raise UserError(f"scene {self.file}: is damaged ({error}): delete it, then it is built again") from None
+        triangles, low, high = zip(*counted, strict=True)
+        x, y, z = (float(v) for v in np.max(high, axis=0) - np.min(low, axis=0))
+        return Contents(sum(triangles), (x, y, z), tuple(sorted(materials)), _lit(self))
 
-@dataclass(frozen=True)
-class Contents:
-    """What a built scene is made of. size: (3,) m, of its box; lit: how many of the settings of light are baked."""
+    @property
+    def built(self) -> str:
+        """Its contents in a line."""
+        return self.contents.text() if self.contents else "not built yet: it is when it is first rendered"
 
-    triangles: int
-    size: tuple[float, float, float]
-    materials: tuple[str, ...]
-    lit: tuple[int, int]
+    def facts(self) -> dict[str, Any]:
+        """Plain values, sizes in m."""
+        contents = self.contents
+        return {
+            "about": self.about, "file": str(self.file), "script": str(self.script), "built": contents is not None,
+            "triangles": None if contents is None else contents.triangles,
+            "size_m": None if contents is None else list(contents.size),
+            "light_baked": None if contents is None else contents.lit[0] == contents.lit[1],
+            "configs": [file.stem for file in self.configs], "takes_seed": self.takes_seed,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Listing:
-    """Scenes with their contents, None where they are not built."""
+    """All scenes below a folder."""
 
-    entries: tuple[tuple[ShippedScene, Contents | None], ...]
+    scenes: tuple[ShippedScene, ...]
     folder: Path
 
     def text(self) -> str:
         """A block of lines a scene."""
         blocks = []
-        for scene, contents in self.entries:
-            lines = [f"{scene.name}: {scene.about}", f"  {_built_text(contents)}"]
+        for scene in self.scenes:
+            lines = [f"{scene.name}: {scene.about}", f"  {scene.built}"]
             lines += [f"  another by seed: {scene.how_to_vary}", "  configs:"]
             lines += [f"    {line}" for line in scene.config_lines]
             blocks.append("\n".join(lines))
@@ -88,25 +131,24 @@ class Listing:
 
     def as_dict(self) -> dict[str, Any]:
         """The same by name, sizes in m."""
-        return {scene.name: _facts(scene, contents) for scene, contents in self.entries}
+        return {scene.name: scene.facts() for scene in self.scenes}
 
 
 @dataclass(frozen=True)
 class Description:
     """One scene in full. floor: y of its largest floor and the free height above it, m, None without a ceiling.
 
-    contents, floor: None where it is not built.
+    floor: None where it is not built.
     """
 
     scene: ShippedScene
-    contents: Contents | None
     floor: tuple[float, float | None] | None
 
     def text(self) -> str:
         """A line a fact."""
-        scene, contents = self.scene, self.contents
+        scene, contents = self.scene, self.scene.contents
         rows = [("what", scene.about), ("file", str(scene.file)), ("script", str(scene.script))]
-        rows.append(("built", _built_text(contents)))
+        rows.append(("built", scene.built))
         if self.floor is not None:
             y, height = self.floor
             high = "no ceiling" if height is None else f"{height:.2f} m free above it"
@@ -121,9 +163,10 @@ class Description:
     def as_dict(self) -> dict[str, Any]:
         """The same as plain values, m."""
         y, height = self.floor or (None, None)
+        contents = self.scene.contents
         return {
-            "name": self.scene.name, **_facts(self.scene, self.contents),
-            "materials": None if self.contents is None else list(self.contents.materials),
+            "name": self.scene.name, **self.scene.facts(),
+            "materials": None if contents is None else list(contents.materials),
             "floor_y_m": y, "free_height_m": height,
         }  # fmt: skip
 
@@ -156,10 +199,9 @@ def shipped_scenes(folder: Path, configs: Path) -> list[ShippedScene]:
 
 
 def list_scenes() -> Listing:
-    """What ships, and what is built and lit of it. Raises UserError if a built scene is damaged."""
+    """What ships, and what is built and lit of it."""
     folder = scenes_folder()
-    scenes = shipped_scenes(folder, configs_folder())
-    return Listing(tuple((scene, _contents(scene)) for scene in scenes), folder)
+    return Listing(tuple(shipped_scenes(folder, configs_folder())), folder)
 
 
 def find_scene(name: str) -> ShippedScene:
@@ -173,8 +215,7 @@ def find_scene(name: str) -> ShippedScene:
 def describe_scene(name: str) -> Description:
     """One scene in full. Raises UserError for an unknown name."""
     scene = find_scene(name)
-    contents = _contents(scene)
-    return Description(scene, contents, None if contents is None else _largest_floor(scene.file))
+    return Description(scene, None if scene.contents is None else _largest_floor(scene.file))
 
 
 def build_variant(name: str, seed: int | None, out: Path) -> Path:
@@ -218,41 +259,6 @@ def _first_sentence(text: str) -> str:
     return sentence if len(sentence) <= _SHORT else sentence[:_SHORT].rpartition(" ")[0] + " ..."
 
 
-def _built_text(contents: Contents | None) -> str:
-    if contents is None:
-        return "not built yet: it is when it is first rendered"
-    lit, settings = contents.lit
-    x, y, z = contents.size
-    light = f"light baked for {lit} of {settings} settings"
-    if lit in (0, settings):
-        light = "light baked" if lit == settings else "light not baked yet"
-    return f"{x:.1f} x {y:.1f} x {z:.1f} m, {contents.triangles:,} triangles, {light}"
-
-
-def _facts(scene: ShippedScene, contents: Contents | None) -> dict[str, Any]:
-    return {
-        "about": scene.about, "file": str(scene.file), "script": str(scene.script), "built": contents is not None,
-        "triangles": None if contents is None else contents.triangles,
-        "size_m": None if contents is None else list(contents.size),
-        "light_baked": None if contents is None else contents.lit[0] == contents.lit[1],
-        "configs": [file.stem for file in scene.configs], "takes_seed": scene.takes_seed,
-    }  # fmt: skip
-
-
-def _contents(scene: ShippedScene) -> Contents | None:
-    """What its file and the meshes that it names hold; None: it is not built. Raises UserError if it is damaged."""
-    if not scene.file.is_file():
-        return None
-    try:
-        meshes, materials = _named(scene.file)
-        counted = [_ply_box(mesh) for mesh in meshes]
-    except (OSError, ET.ParseError, KeyError, ValueError, IndexError) as error:
-        raise UserError(f"scene {scene.file}: is damaged ({error}): delete it, then it is built again") from None
-    triangles, low, high = zip(*counted, strict=True)
-    x, y, z = (float(v) for v in np.max(high, axis=0) - np.min(low, axis=0))
-    return Contents(sum(triangles), (x, y, z), tuple(sorted(materials)), _lit(scene))
-
-
 def _named(file: Path) -> tuple[list[Path], set[str]]:
     """The mesh files and the ids of the materials of a scene file and of those that it includes."""
     root = ET.fromstring(file.read_bytes())
@@ -285,11 +291,8 @@ def _ply_box(path: Path) -> tuple[int, FloatArray, FloatArray]:
 
 def _lit(scene: ShippedScene) -> tuple[int, int]:
     """How many of the settings of light with which its configs render it are baked, and of how many."""
-    from rsgen.device.backend import mitsuba
-
     mitsuba()
-    from rsgen.light.cache import cache_folder, cache_key
-    from rsgen.scene.loading import content_hash
+    from rsgen.light.bake import cache_folder, cache_key
 
     lights = [load_config(file).light for file in scene.configs] or [LightConfig()]
     state = content_hash(scene.file)
@@ -300,9 +303,6 @@ def _lit(scene: ShippedScene) -> tuple[int, int]:
 
 def _largest_floor(file: Path) -> tuple[float, float | None] | None:
     """`Description.floor` of a built scene: of floors with a ceiling, as `motion suggest` finds them, else of all."""
-    from rsgen.motion.floor_plan import find_floors
-    from rsgen.scene.loading import load_scene
-    from rsgen.scene.meshes import surface
     from rsgen.scene.rays import cast_rays
 
     loaded = load_scene(file)

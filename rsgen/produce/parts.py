@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.config.cameras import ColorConfig, StreamConfig
+from rsgen.config.cameras import ColorConfig
 from rsgen.config.config import Backend, Config
-from rsgen.config.motion import ObjectConfig
-from rsgen.config.sections import LightConfig, SceneConfig, TrajectoryConfig
+from rsgen.config.sections import LightConfig, TrajectoryConfig
 from rsgen.console.progress import Progress, no_progress
+from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -26,9 +26,12 @@ from rsgen.motion.fit import FitResult, fit_spline
 from rsgen.motion.make import make_motion, with_tremor
 from rsgen.motion.object_paths import object_spline
 from rsgen.motion.stretch import along, cut
-from rsgen.produce.camera_sources import Stage
-from rsgen.produce.frame_source import FrameSource
+from rsgen.produce.camera_sources import FrameSource, Stage
 from rsgen.produce.records import fingerprint
+from rsgen.scene import loading
+from rsgen.scene.loading import Board
+from rsgen.scene.object_meshes import load_object, object_hash
+from rsgen.scene.placement import SceneOptions
 from rsgen.sequence.format import stream_stamps
 from rsgen.sequence.trajectory import Trajectory, read_trajectory
 
@@ -74,7 +77,9 @@ def load_motion(config: Config) -> TrueMotion:
         recorded = fit_spline(trajectory, dt=spacing, smoothing=smoothing)
         trajectory, spacing = with_tremor(recorded.spline, config.tremor, config.seed, trajectory.stamps[[0, -1]])
         smoothing = 0.0
-    before, after = _padding(*config.cameras.values())
+    # Lines of frames are exposed before the first pose and read after the last.
+    before = max(s.longest_exposure_s - min(s.offset_s, 0.0) for s in config.cameras.values())
+    after = max(s.readout_s for s in config.cameras.values())
     if config.stretch is not None:
         return _stretch(config, trajectory, recorded, before, after, spacing, smoothing)
     fit = fit_spline(trajectory, dt=spacing, smoothing=smoothing, pad_begin_s=before, pad_end_s=after)
@@ -111,12 +116,6 @@ def sequence_stamps(config: Config, motion: TrueMotion) -> dict[str, FloatArray]
     return {s: stream_stamps(motion.first_stamp, motion.last_stamp, stream) for s, stream in config.cameras.items()}
 
 
-def _padding(*streams: StreamConfig) -> tuple[float, float]:
-    """Seconds before the first pose and after the last one in which lines of the streams are exposed."""
-    before = max(s.longest_exposure_s - min(s.offset_s, 0.0) for s in streams)
-    return before, max(s.readout_s for s in streams)
-
-
 def _recorded(settings: TrajectoryConfig) -> Trajectory:
     assert settings.file is not None  # or there were a motion
     trajectory = read_trajectory(settings.file, format=settings.format, icl_start=settings.icl_start)
@@ -147,30 +146,20 @@ def lines_of_sight(config: Config) -> tuple[FloatArray, FloatArray]:
 
 def load_scene(config: Config) -> Any:
     """The config's Mitsuba scene, with its target if it has one. Raises UserError."""
-    from rsgen.device.backend import mitsuba
-
     mitsuba(config.backend)
-    from rsgen.scene import loading
-    from rsgen.scene.board import Board
-
     target = config.target
     board = None if target is None else Board(target.grid, np.array(target.T_world_target, float))
-    return loading.load_scene(config.scene.file, board, _options(config.scene))
+    return loading.load_scene(config.scene.file, board, _options(config))
 
 
 def scene_hash(config: Config) -> str:
     """Content hash of the config's scene with all its files. Raises UserError."""
-    from rsgen.device.backend import mitsuba
-
     mitsuba(config.backend)
-    from rsgen.scene.loading import content_hash
-
-    return content_hash(config.scene.file, _options(config.scene))
+    return loading.content_hash(config.scene.file, _options(config))
 
 
-def _options(scene: SceneConfig) -> Any:
-    from rsgen.scene.placement import SceneOptions
-
+def _options(config: Config) -> SceneOptions:
+    scene = config.scene
     return SceneOptions(scene.scale, scene.up, scene.light, scene.skip_missing)
 
 
@@ -180,23 +169,10 @@ def surfaces_hash(config: Config) -> str:
     return scene if target is None else fingerprint({"scene": scene, "target": target.model_dump(mode="json")})
 
 
-def load_meshes(objects: Sequence[ObjectConfig]) -> tuple[Any, ...]:
-    """An `ObjectMesh` of each object. Raises UserError."""
-    from rsgen.scene.object_meshes import load_object
-
-    return tuple(load_object(thing) for thing in objects)
-
-
-def mesh_hashes(objects: Sequence[ObjectConfig], backend: Backend) -> dict[str, str]:
+def mesh_hashes(config: Config) -> dict[str, str]:
     """Content hashes of the objects' meshes, by names for sequence.yaml. Raises UserError."""
-    if not objects:
-        return {}
-    from rsgen.device.backend import mitsuba
-
-    mitsuba(backend)
-    from rsgen.scene.object_meshes import object_hash
-
-    return {f"object {thing.name}": object_hash(thing) for thing in objects}
+    mitsuba(config.backend)
+    return {f"object {thing.name}": object_hash(thing) for thing in config.objects}
 
 
 def input_hashes(config: Config) -> dict[str, str]:
@@ -204,7 +180,7 @@ def input_hashes(config: Config) -> dict[str, str]:
     hashes, file = {}, config.trajectory.file
     if file is not None:
         hashes["trajectory"] = hashlib.sha256(file.read_bytes()).hexdigest()
-    hashes |= {"scene": scene_hash(config)} | mesh_hashes(config.objects, config.backend)
+    hashes |= {"scene": scene_hash(config)} | mesh_hashes(config)
     for thing in config.objects:
         if thing.motion.file is not None:
             hashes[f"motion of {thing.name}"] = _file_hash(thing.motion.file, thing.name)
@@ -220,8 +196,6 @@ def _file_hash(path: Path, name: str) -> str:
 
 def engine_versions(backend: Backend) -> dict[str, str]:
     """Versions of the programs that decide a sequence's bytes, and the Dr.Jit variant that runs."""
-    from rsgen.device.backend import mitsuba
-
     names = ("rolling-shutter-rgbd", "mitsuba", "drjit", "numpy", "scipy")
     return {name: version(name) for name in names} | {"variant": mitsuba(backend).variant()}
 
@@ -237,39 +211,36 @@ class LoadedScene:
     integrator: Any
 
 
-def load_scene_and_light(config: Config, progress: Progress = no_progress) -> LoadedScene:
-    """Load the scene and its light, baked now if no cache has it. Raises UserError."""
-    from rsgen.device.backend import mitsuba
+def load_scene_and_light(
+    config: Config, progress: Progress = no_progress, scene: Any = None, objects: Sequence[Spline] = ()
+) -> LoadedScene:
+    """Load the scene, unless it is given, and its light, baked now if no cache has it. Raises UserError.
 
-    mi = mitsuba(config.backend)
-    scene = load_scene(config)
-    return LoadedScene(scene, make_integrator(mi, scene, config, progress))
+    objects: T_world_object(t) of the config's, all of them, where they are to be seen.
+    """
+    mi, scene = mitsuba(config.backend), scene or load_scene(config)
+    return LoadedScene(scene, make_integrator(mi, scene, config, progress, objects))
 
 
 def open_frames(
     config: Config, progress: Progress = no_progress, global_shutter: bool = False, scene: Any = None,
     objects: Sequence[Spline] = (), loaded: LoadedScene | None = None,
 ) -> FrameSource:  # fmt: skip
-    """Load the scene, unless it is given, and its light (baked now if no cache has it). Raises UserError.
+    """Frames of the config's cameras. scene, objects: see `load_scene_and_light`, which is used if nothing is loaded.
 
-    global_shutter: all lines of a frame at once. objects: T_world_object(t) of the config's, all of them. loaded: by
-    `load_scene_and_light` for an equal scene, light and spp.
+    global_shutter: all lines of a frame at once. loaded: of an equal scene, light and spp. Raises UserError.
     """
-    from rsgen.device.backend import mitsuba
-
-    mi = mitsuba(config.backend)
-    scene = loaded.scene if loaded else scene or load_scene(config)
-    integrator = loaded.integrator if loaded else make_integrator(mi, scene, config, progress, objects)
-    things = integrator.objects if objects else None
-    instances = scene_instances(scene, config) if config.truth.labels else None
-    return FrameSource(Stage(scene, integrator, things, config.seed, global_shutter, instances), config)
+    loaded = loaded or load_scene_and_light(config, progress, scene, objects)
+    things = loaded.integrator.objects if objects else None
+    instances = scene_instances(loaded.scene, config) if config.truth.labels else None
+    return FrameSource(Stage(loaded.scene, loaded.integrator, things, config.seed, global_shutter, instances), config)
 
 
 def scene_instances(scene: Any, config: Config) -> Any:
     """`rsgen.truth.instances.Instances` of the config's loaded scene. Raises UserError."""
     from rsgen.truth.instances import find_instances
 
-    return find_instances(scene, config.scene.file, _options(config.scene))
+    return find_instances(scene, config.scene.file, _options(config))
 
 
 def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, objects: Sequence[Spline] = ()) -> Any:
@@ -280,7 +251,7 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, obj
     light = config.light
     if light.mode == "path":
         return mi.load_dict({"type": "path", "max_depth": light.max_depth})
-    from rsgen.light.cache import baked_field, cache_folder
+    from rsgen.light.bake import baked_field, cache_folder
     from rsgen.render.baked import BakedIntegrator
 
     try:
@@ -289,7 +260,7 @@ def make_integrator(mi: Any, scene: Any, config: Config, progress: Progress, obj
     except UserError as error:
         text = str(error)
         raise UserError(text if text.startswith("scene ") else f"scene {config.scene.file}: {text}") from None
-    things = _lit_objects(scene, field, load_meshes(config.objects), objects) if objects else None
+    things = _lit_objects(scene, field, list(map(load_object, config.objects)), objects) if objects else None
     view = config.cameras[config.view]
     spp = view.spp if isinstance(view, ColorConfig) else 1
     return BakedIntegrator(field, glossy_spp=mirrored_samples(light, spp), objects=things)

@@ -16,10 +16,10 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.config.cameras import ColorConfig, DepthConfig, StreamConfig
 from rsgen.config.config import Config
 from rsgen.config.faults import ImuFaults, moved_to
-from rsgen.config.imu import ImuConfig
 from rsgen.config.rig import RigColorConfig, RigDepthConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml
+from rsgen.files import atomic_write, encode_yaml, is_temporary, read_yaml, write_lines
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import (
@@ -32,22 +32,23 @@ from rsgen.sensors.imu import (
     write_imu_csv,
 )
 from rsgen.sensors.reports import deliver, reported_poses
-from rsgen.sequence.camera_yaml import Cameras
 from rsgen.sequence.format import (
     CLEAN_COLOR,
+    FILES,
     FORMAT,
     OBJECT_CHANNELS,
     OBJECT_IDS,
     RIG_FORMAT,
     STREAMS,
+    StreamFiles,
     associate,
     frame_name,
     ground_truth,
     line_poses,
     pose_lines,
+    rig_files,
     round_stamps,
 )
-from rsgen.sequence.stream_files import FILES, StreamFiles, rig_files
 from rsgen.sequence.truth_files import FrameTable
 
 
@@ -125,13 +126,6 @@ def _rows(T: Sequence[Sequence[float]]) -> list[list[float]]:
 
 def _truth_yaml(config: Config, camera: str) -> dict[str, list[str]]:
     return {name: list(channels) for name, channels in image_truth(config, camera).items()}
-
-
-def true_cameras(config: Config) -> Cameras:
-    """The cameras that take the images, whatever `faults.declared` states."""
-    color, depth = config.color, config.depth
-    T_color_depth = np.array(config.T_color_depth, float)
-    return Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)
 
 
 def image_truth(config: Config, camera: str) -> dict[str, tuple[str, ...]]:
@@ -304,8 +298,3 @@ def write_imu(
         T = np.eye(4) if T_image_depth is None else T_image_depth
         atomic_write(out / IMU_TRUTH_CSV, imu_truth_csv(samples).encode())
         atomic_write(out / IMU_TRUTH_YAML, encode_yaml(imu_truth_yaml(imu, faults, start, middle, T)))
-
-
-def write_lines(path: Path, lines: list[str]) -> None:
-    """A text file of these lines. Raises UserError if the disk refuses it."""
-    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())

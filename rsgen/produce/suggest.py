@@ -24,8 +24,7 @@ from rsgen.errors import UserError
 from rsgen.files import encode_yaml
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rsgen.motion.clearance import clearance, plan_tour
-from rsgen.motion.floor_plan import FloorPlan
+from rsgen.motion.free_space import FloorPlan, clearance, plan_tour
 from rsgen.motion.make import least_turning
 from rsgen.motion.walk import AZIMUTHS, ELEVATIONS_DEG, choose_targets, ring, walk_inside
 from rsgen.produce.generate import scene_triangles

@@ -13,7 +13,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.motion.floor_plan import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
+from rsgen.motion.free_space import HIGHEST_M, Cast, FloorPlan, find_floors, floor_plan, share_without_floor
 from rsgen.motion.statistics import motion_statistics
 from rsgen.motion.walk import free_region
 from rsgen.produce.views import MOST_CLIPPED, Exposure, Scores, Shine

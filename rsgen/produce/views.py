@@ -16,7 +16,8 @@ import numpy as np
 from rsgen import srgb
 from rsgen.array_types import BoolArray, Float32Array, FloatArray
 from rsgen.geometry.camera import Camera
-from rsgen.motion.floor_plan import Cast
+from rsgen.motion.free_space import Cast
+from rsgen.motion.walk import unit_directions
 from rsgen.produce.camera_sources import small_camera
 
 Shine = Callable[[FloatArray, FloatArray], Float32Array]
@@ -237,9 +238,7 @@ def plainness(p_world: FloatArray, shine: Shine, azimuths: int, elevations_deg: 
     wide, high = round(360.0 / azimuths / _PANORAMA_DEG), round(step / _PANORAMA_DEG)
     columns = ((np.arange(azimuths * wide) + 0.5) / wide - 0.5) * (math.tau / azimuths)
     rows = np.radians((np.arange(len(elevations_deg) * high) + 0.5) / high * step - 0.5 * step + elevations_deg[0])
-    azimuth, elevation = np.meshgrid(columns, rows, indexing="ij")
-    level = np.cos(elevation)
-    rays = np.stack([level * np.cos(azimuth), np.sin(elevation), level * np.sin(azimuth)], axis=-1)
+    rays = unit_directions(*np.meshgrid(columns, rows, indexing="ij"))
     flat = np.tile(rays.reshape(-1, 3), (len(p_world), 1))
     light = shine(np.repeat(p_world, rays[..., 0].size, axis=0), flat).reshape(2, len(p_world), *rays.shape)
     light = _smoothed(light)

@@ -15,23 +15,21 @@ from rsgen.array_types import ByteArray, Float32Array, FloatArray, UInt16Array
 from rsgen.config.cameras import DepthConfig
 from rsgen.config.config import Config
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error
+from rsgen.files import atomic_write, encode_yaml, remove_stale_temporaries, write_error, write_lines
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_exr, encode_npy, encode_npz, encode_png, read_png
 from rsgen.produce.records import (
     ListedStream,
     describe,
     refuse_foreign_folder,
-    true_cameras,
     write_ground_truth,
     write_imu,
-    write_lines,
     write_listings,
 )
 from rsgen.sensors.color import Setting
 from rsgen.sensors.imu import sample_clock
 from rsgen.sensors.reports import color_clock
-from rsgen.sequence.camera_yaml import TRUE_CAMERAS, camera_yaml
+from rsgen.sequence.camera_yaml import TRUE_CAMERAS, Cameras, camera_yaml
 from rsgen.sequence.format import (
     LABELS_IMAGE,
     OBJECT_CHANNELS,
@@ -41,8 +39,7 @@ from rsgen.sequence.format import (
     line_poses,
     pose_lines,
 )
-from rsgen.sequence.labels import boxes_text
-from rsgen.sequence.truth_files import TARGET_CORNERS, poses_file, spline_file, target_corners_text
+from rsgen.sequence.truth_files import TARGET_CORNERS, boxes_text, poses_file, spline_file, target_corners_text
 
 _SPLINE_TOLERANCE = 1e-9
 
@@ -96,17 +93,27 @@ class SequenceWriter:
             # First of all, so that a run that ends here leaves either nothing or what it can be resumed from.
             if not (out / "sequence.yaml").exists():
                 atomic_write(out / "sequence.yaml", encode_yaml(text))
-            folders = {folder for stream in streams.values() for folder in _folders(stream, bool(objects))}
-            folders |= {stream.files.labels for stream in streams.values() if config.truth.labels}
-            for folder in (*folders, *([OBJECTS] if objects else [])):
-                (out / folder).mkdir(parents=True, exist_ok=True)
-            for folder in ("", "truth", *folders):
+            opened = cls(out, config, spline, streams, objects=tuple(objects))
+            for folder in ("", "truth", *opened.make_folders()):
                 remove_stale_temporaries(out / folder)
         except OSError as error:
             raise write_error(out, error) from None
         moving = zip(config.objects, objects, strict=True)
         things = tuple(_stored_spline(out / spline_file(thing.name), s) for thing, s in moving)
-        return cls(out, config, _stored_spline(out / "spline.npz", spline), streams, objects=things)
+        return replace(opened, spline=_stored_spline(out / "spline.npz", spline), objects=things)
+
+    def make_folders(self) -> list[str]:
+        """Make those of images and splines; returns where they are within `out`. Raises OSError."""
+        folders = [OBJECTS] if self.objects else []
+        for stream in self.streams.values():
+            files = stream.files
+            folders += [files.images, files.truth, *(f"{files.truth}/{name}" for name in stream.truth)]
+            if isinstance(stream.config, DepthConfig):
+                folders += [files.exact_depth, *([files.object_ids] if self.objects else [])]
+            folders += [files.labels] if self.config.truth.labels else []
+        for folder in folders:
+            (self.out / folder).mkdir(parents=True, exist_ok=True)
+        return folders
 
     def stamps(self, stream: str) -> FloatArray:
         """True stamps (n,) of all frames of a stream, s."""
@@ -185,11 +192,11 @@ class SequenceWriter:
         own = listed.config.camera
         if ids is not None:
             _expect(ids, (own.height, own.width), np.float32)
-            atomic_write(self._ids_path(stream, k), encode_exr(ids, OBJECT_CHANNELS))
+            atomic_write(self._file(listed.files.object_ids, k, ".exr"), encode_exr(ids, OBJECT_CHANNELS))
         _expect(z, (own.height, own.width), np.float32)
         camera = listed.image_camera
         _expect(z if reported is None else reported, (camera.height, camera.width), np.float32)
-        atomic_write(self._exact_path(stream, k), encode_exr(_positive(z)))
+        atomic_write(self._file(listed.files.exact_depth, k, ".exr"), encode_exr(_positive(z)))
         assert isinstance(listed.config, DepthConfig)
         units = quantise(_positive(z if reported is None else reported), listed.config.depth_scale)
         atomic_write(self._path(stream, k), encode_png(units))
@@ -218,7 +225,7 @@ class SequenceWriter:
             for name, stream in self.streams.items():
                 camera = stream.config.camera
                 shape = camera.height, camera.width
-                frames = ((k, read_png(self._labels_path(name, k), shape, np.uint16)) for k in written[name])
+                frames = ((k, read_png(self._file(stream.files.labels, k), shape, np.uint16)) for k in written[name])
                 atomic_write(out / stream.files.boxes, boxes_text(frames).encode())
         last = list(self.streams.values())[-1]  # of two cameras depth
         delivered = last.table.listed_s[last.is_delivered]
@@ -226,8 +233,8 @@ class SequenceWriter:
         if faults.declared is not None:
             firsts = float(stamps["color"][0]), float(stamps["depth"][0])
             clock = color_clock(faults.color, faults.depth, *firsts, middle)
-            cameras = camera_yaml(true_cameras(config), clock, config.depth.registered)
-            atomic_write(out / TRUE_CAMERAS, encode_yaml(cameras))
+            cameras = Cameras.of(config.color, config.depth, config.T_color_depth)
+            atomic_write(out / TRUE_CAMERAS, encode_yaml(camera_yaml(cameras, clock, config.depth.registered)))
         if (target := config.target) is not None:
             text = target_corners_text(target.grid, np.array(target.T_world_target, float))
             atomic_write(out / TARGET_CORNERS, text.encode())
@@ -240,42 +247,27 @@ class SequenceWriter:
         if labels is not None:
             camera = self.streams[stream].config.camera
             _expect(labels, (camera.height, camera.width), np.uint16)
-            atomic_write(self._labels_path(stream, k), encode_png(labels))
-
-    def _labels_path(self, stream: str, k: int) -> Path:
-        return self.out / self.streams[stream].files.labels / f"{frame_name(k)}.png"
+            atomic_write(self._file(self.streams[stream].files.labels, k), encode_png(labels))
 
     def _path(self, stream: str, k: int) -> Path:
         if not 0 <= k < len(self.stamps(stream)):
             raise IndexError(f"frame {k} of {len(self.stamps(stream))}")
-        return self.out / self.streams[stream].files.images / f"{frame_name(k)}.png"
+        return self._file(self.streams[stream].files.images, k)
 
-    def _exact_path(self, stream: str, k: int) -> Path:
-        return self.out / self.streams[stream].files.exact_depth / f"{frame_name(k)}.exr"
-
-    def _ids_path(self, stream: str, k: int) -> Path:
-        return self.out / self.streams[stream].files.object_ids / f"{frame_name(k)}.exr"
+    def _file(self, folder: str, k: int, suffix: str = ".png") -> Path:
+        return self.out / folder / f"{frame_name(k)}{suffix}"
 
     def _is_written(self, stream: str, k: int) -> bool:
         # Atomic writes leave whole files only, so being there is enough; an empty one was made by something else.
         listed = self.streams[stream]
+        files, paths = listed.files, [self._path(stream, k)]
         if isinstance(listed.config, DepthConfig):
-            truth = [self._exact_path(stream, k), *([self._ids_path(stream, k)] if self.objects else [])]
+            paths += [self._file(files.exact_depth, k, ".exr")]
+            paths += [self._file(files.object_ids, k, ".exr")] if self.objects else []
         else:
-            files = (listed.files.truth_image(name, channels, frame_name(k)) for name, channels in listed.truth.items())
-            truth = [self.out / file for file in files]
-        truth += [self._labels_path(stream, k)] if self.config.truth.labels else []
-        paths = [self._path(stream, k), *truth]
+            paths += [self.out / files.truth_image(name, c, frame_name(k)) for name, c in listed.truth.items()]
+        paths += [self._file(files.labels, k)] if self.config.truth.labels else []
         return all(path.is_file() and path.stat().st_size > 0 for path in paths)
-
-
-def _folders(stream: ListedStream, has_objects: bool) -> list[str]:
-    """Of a stream's images, within the sequence's folder."""
-    files = stream.files
-    folders = [files.images, files.truth, *(f"{files.truth}/{name}" for name in stream.truth)]
-    if isinstance(stream.config, DepthConfig):
-        folders += [files.exact_depth, *([files.object_ids] if has_objects else [])]
-    return folders
 
 
 def _kept(image: npt.NDArray[Any], is_grey: bool) -> npt.NDArray[Any]:

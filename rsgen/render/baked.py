@@ -15,6 +15,7 @@ _DIFFUSE = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.DiffuseTransmi
 _SPECULAR = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.Null)
 _GLOSSY = int(mi.BSDFFlags.Glossy)
 _FROSTED = int(mi.BSDFFlags.GlossyTransmission)
+_MOST_MIRRORS = 16  # before a glossy hit: a glass of wine has twelve
 _MOST_LIGHTS = 16  # light samples at a glossy hit
 _PANE = int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.Null)
 _CERTAINLY = 1 - 2**-20  # a random number that no pane reflects at, but where it reflects all
@@ -26,25 +27,21 @@ class BakedIntegrator(mi.SamplingIntegrator):
     """Radiance from baked irradiance: emission + diffuse lobe x E, and traced bounces for all other lobes.
 
     The diffuse lobe of a plastic is weighted with one cosine-distributed direction, which is nearly free of noise.
-    Glossy lobes are sampled and traced onto the baked surfaces, behind up to `bounces` mirrors: a glass of wine has
-    twelve. They cost ten times as much: of a pixel's samples only `glossy_spp` are traced there, of the others what is
-    matte is shown.
+    Glossy lobes are sampled and traced onto the baked surfaces, behind mirrors too. They cost ten times as much: of a
+    pixel's samples only `glossy_spp` are traced there, of the others what is matte is shown.
     """
 
-    def __init__(
-        self, field: IrradianceField, bounces: int = 16, glossy_spp: int = 16, objects: MovingObjects | None = None
-    ) -> None:
+    def __init__(self, field: IrradianceField, glossy_spp: int = 16, objects: MovingObjects | None = None) -> None:
         """objects: that stand before the scene in `matte`, and take light from it; `sample` shows the scene alone."""
         super().__init__(mi.Properties())
         self._field = field if objects is None else ShadedField(field, objects)
         self.objects = objects
-        self._bounces = bounces
         self.glossy_spp = glossy_spp
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True):
         """Mitsuba's interface: radiance along rays, whether they hit, no AOVs."""
         u = sampler.next_2d(), sampler.next_2d()
-        radiance, valid = trace_baked(scene, self._field, sampler, mi.Ray3f(ray), self._bounces, mi.Bool(active), *u)
+        radiance, valid = trace_baked(scene, self._field, sampler, mi.Ray3f(ray), mi.Bool(active), *u)
         return radiance, valid, []
 
     @property
@@ -57,7 +54,7 @@ class BakedIntegrator(mi.SamplingIntegrator):
         the first surface's lobe is looked along and where on lamps.
         """
         ray, active = mi.Ray3f(ray), mi.Bool(True)
-        return trace_baked(scene, self._field, sampler, ray, self._bounces, active, lobe, lamps, matte_too=False)[0]
+        return trace_baked(scene, self._field, sampler, ray, active, lobe, lamps, matte_too=False)[0]
 
     def matte(self, scene: Any, ray: Any, u: Any) -> tuple[Any, Any]:
         """Radiance where the first hit is purely diffuse (or none), exact for Lambert's law, and a mask of the rest:
@@ -90,7 +87,7 @@ class BakedIntegrator(mi.SamplingIntegrator):
 
 
 @dr.syntax
-def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_lamp, matte_too=True):
+def trace_baked(scene, field, sampler, ray, active, first_lobe, first_lamp, matte_too=True):
     """Radiance (Color3f) along `ray` and whether it hit a surface; see `BakedIntegrator`.
 
     first_lobe, first_lamp: uniform (Point2f), for the first surface's lobe and for each of the lamps that it mirrors.
@@ -148,7 +145,7 @@ def trace_baked(scene, field, sampler, ray, bounces, active, first_lobe, first_l
         counts = active & ~further & ((depth > 0) | matte_too)
         radiance[counts] += throughput * irradiance * dr.select(last, albedo * dr.inv_pi, lobe)
 
-        active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < bounces)
+        active &= ((bsdf.flags() & _SPECULAR) != 0) & ~last & (depth < _MOST_MIRRORS)
         flags = bsdf.flags()
         frosted = (flags & _FROSTED) != 0
         smooth = active & ((flags & _GLOSSY) != 0) & ~frosted

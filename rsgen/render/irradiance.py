@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, IntArray
 from rsgen.device.arrays import aligned, vectors
 from rsgen.errors import UserError
-from rsgen.scene.meshes import coarser, inhabited_box, mesh_arrays
+from rsgen.scene.meshes import coarser, inhabited_box, mesh_corners, meshes_of
 
 REACH_LEVELS = 31  # how far a sample counts towards a neighbour: level / 30 of the way
 FREE = REACH_LEVELS  # and this, beyond the neighbour: nothing stands between
@@ -46,14 +46,22 @@ class Lattice:
     lacquered: NDArray[np.bool_]
     points: int
 
-    def packed(self) -> NDArray[np.uint32]:
-        """(f,) cells and apex of each triangle in one word for the device."""
-        return (self.cells[:, 0] | self.cells[:, 1] << 12 | self.apex << 24).astype(np.uint32)
+    @property
+    def counts(self) -> IntArray:
+        """(f,) points of each triangle."""
+        return (self.cells + 1).prod(axis=1)
+
+    def places(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Triangle of each point, and the row along u and the column along v that it is in, (points,) each."""
+        face = np.repeat(np.arange(len(self.first)), self.counts)
+        row, column = np.divmod(np.arange(self.points) - self.first[face], self.cells[face, 1] + 1)
+        return face, row, column
 
 
-def registry_id(shape: Any) -> int:
-    """Dr.Jit's number of a shape, which a `ShapePtr` on the device holds."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+def registry_id(thing: Any) -> int:
+    """Dr.Jit's number of a shape or an emitter, which a pointer to it on the device holds."""
+    pointer = mi.EmitterPtr if isinstance(thing, mi.Emitter) else mi.ShapePtr
+    return int(dr.reinterpret_array(mi.UInt32, pointer(thing))[0])
 
 
 def make_lattice(scene: Any, spacing: float) -> Lattice:
@@ -61,22 +69,21 @@ def make_lattice(scene: Any, spacing: float) -> Lattice:
 
     Raises UserError, before it takes the memory, if baking so many samples would need more than 4 GB.
     """
-    shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    shapes = meshes_of(scene)
     ids = [registry_id(shape) for shape in shapes]
     shape_first = np.full(max(ids) + 1, -1, np.int32)
     lacquered = np.zeros(len(shape_first), bool)
     sides, apexes, faces_before = [], [], 0
     box = inhabited_box(shapes)
     for shape, number in zip(shapes, ids, strict=True):
-        vertices, faces = mesh_arrays(shape)
-        corners = vertices[faces].astype(np.float64)
+        corners = mesh_corners(shape)
         # edge k is opposite corner k
         edges = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, -2, axis=1), axis=-1)
         sides.append(np.stack([edges.max(axis=1), edges.min(axis=1)], axis=1) / coarser(corners, box)[:, None])
         apexes.append(np.argmin(edges, axis=1))
         shape_first[number] = faces_before
         lacquered[number] = _lacquered(shape.bsdf())
-        faces_before += len(faces)
+        faces_before += len(corners)
     lengths = np.concatenate(sides)
     _check_size(lengths, spacing)
     cells = _cells(lengths, spacing)
@@ -134,10 +141,7 @@ def _gigabytes(points: int) -> str:
 
 def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
     """Triangle index (points,) and Mitsuba's barycentric (b1, b2) (points, 2) of every lattice point."""
-    counts = (lattice.cells + 1).prod(axis=1)
-    face = np.repeat(np.arange(len(counts)), counts)
-    local = np.arange(lattice.points) - lattice.first[face]
-    row, column = np.divmod(local, lattice.cells[face, 1] + 1)
+    face, row, column = lattice.places()
     u, v = (k / np.maximum(n, 1) for k, n in zip((row, column), lattice.cells[face].T, strict=True))
     alone = lattice.cells[face, 0] == 0
     u[alone], v[alone] = 2 / 3, 0.5  # the middle
@@ -152,13 +156,9 @@ def lattice_barycentric(lattice: Lattice) -> tuple[IntArray, Float32Array]:
 
 def lattice_area(scene: Any, lattice: Lattice) -> NDArray[np.float64]:
     """Area (points,) in m² that each lattice point stands for on one side: a triangle's points share out its own."""
-    meshes = [mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()]
-    corners = np.concatenate([vertices[faces].astype(np.float64) for vertices, faces in meshes])
-    triangle = trimesh.triangles.area(corners)
-    counts = (lattice.cells + 1).prod(axis=1)
-    face = np.repeat(np.arange(len(counts)), counts)
+    triangle = trimesh.triangles.area(np.concatenate([mesh_corners(shape) for shape in meshes_of(scene)]))
+    face, row, column = lattice.places()
     nu, nv = lattice.cells[face].T
-    row, column = np.divmod(np.arange(lattice.points) - lattice.first[face], nv + 1)
     # Across a grid line at u a triangle is as wide as u: the strip about it, cut off at u = 1, has so much of the area.
     strip = np.minimum(row + 0.5, nu) ** 2 - np.maximum(row - 0.5, 0) ** 2
     along = np.where((column == 0) | (column == nv), 0.5, 1.0) / np.maximum(nv, 1)
@@ -194,20 +194,29 @@ class IrradianceField:
     beyond a wall, or under what lies on the surface, does not count on this side of it (see `packed_reach`).
     """
 
-    def __init__(
-        self, shape_first: Any, lacquered: Any, faces: Any, values: Any, share: Any, face_count: int
-    ) -> None:  # fmt: skip
-        """`shape_first` Int32 and `lacquered` UInt32 (0, 1) by registry id; `faces` UInt32 pairs (first point, packed
-        cells and apex), front sides then back sides; per lattice point of each stored side `values` Float, (E_r, E_g,
-        E_b, w): w is 0 for a point that is not alive, else 1 + its reach; and `share` Float, beneath lacquer (see
-        `light.bake`).
+    def __init__(self, lattice: Lattice, front: Float32Array, back: Float32Array) -> None:
+        """front, back: of each lattice point (points, 5): E_r, E_g, E_b (scene units); 0 for a point that is not alive,
+        else 1 + its reach; and its share beneath lacquer (see `light.bake`). Without a fifth column that is 1.
+
+        Tables: faces has pairs (first point, packed cells and apex), front sides then back sides. Unlit back sides
+        share one dark cell.
         """
-        self.shape_first = shape_first
-        self.lacquered = lacquered
-        self.faces = faces
-        self.values = values
-        self.share = share
-        self.back_first = dr.opaque(mi.UInt32, face_count)  # else kernels are compiled for each number of triangles
+        counts, packed = lattice.counts, lattice.cells[:, 0] | lattice.cells[:, 1] << 12 | lattice.apex << 24
+        lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
+        dark = lattice.points  # four zero entries follow the front values
+        of_back = np.where(lit, counts, 0)
+        back_first = np.where(lit, dark + 4 + np.cumsum(of_back) - of_back, dark)
+        back_packed = np.where(lit, packed, 1 | 1 << 12)
+        first, both = np.concatenate([lattice.first, back_first]), np.concatenate([packed, back_packed])
+        parts = front, np.zeros((4, front.shape[1]), np.float32), back[np.repeat(lit, counts)]
+        # One after the other: each is copied twice on its way to the device.
+        self.values = mi.Float(aligned(np.concatenate([part[:, :4] for part in parts])))
+        shares = [part[:, 4] if front.shape[1] == 5 else np.ones(len(part)) for part in parts]
+        self.share = mi.Float(aligned(np.concatenate(shares)))
+        self.shape_first = mi.Int32(aligned(lattice.shape_first, np.int32))  # by registry id
+        self.lacquered = mi.UInt32(aligned(lattice.lacquered, np.uint32))  # likewise
+        self.faces = mi.UInt32(aligned(np.stack([first, both], axis=1), np.uint32))
+        self.back_first = dr.opaque(mi.UInt32, len(lattice.first))  # else kernels are made for each number of triangles
 
     def beneath_lacquer(self, shape: Any, active: Any) -> Any:
         """Whether what is matte of a shape (ShapePtr) is lit by what gets into lacquer."""
@@ -256,32 +265,3 @@ class IrradianceField:
 def _reach(code: Any) -> Any:
     """Part of the way to the neighbour, above 1 where it is free."""
     return mi.Float(FREE - (code & 31)) / (REACH_LEVELS - 1)
-
-
-def make_field(lattice: Lattice, front: Float32Array, back: Float32Array) -> IrradianceField:
-    """Upload values (points, 4 or 5) of both sides, as `IrradianceField` has them, in the fifth column each one's share
-    (none: 1); unlit back sides share one dark cell.
-    """
-    packed = lattice.packed()
-    lit = np.maximum.reduceat(back[:, 3], lattice.first) > 0
-    keep = np.repeat(lit, (lattice.cells + 1).prod(axis=1))
-    counts = np.where(lit, (lattice.cells + 1).prod(axis=1), 0)
-    dark = lattice.points  # four zero entries follow the front values
-    back_first = np.where(lit, dark + 4 + np.cumsum(counts) - counts, dark)
-    back_packed = np.where(lit, packed, np.uint32(1 | 1 << 12))
-    faces = np.stack(
-        [np.concatenate([lattice.first, back_first]), np.concatenate([packed, back_packed])], axis=1
-    ).astype(np.uint32)
-    parts = front, np.zeros((4, front.shape[1]), np.float32), back[keep]
-    # One after the other: each is copied twice on its way to the device.
-    values = mi.Float(aligned(np.concatenate([part[:, :4] for part in parts])))
-    has_share = front.shape[1] == 5
-    share = mi.Float(aligned(np.concatenate([part[:, 4] if has_share else np.ones(len(part)) for part in parts])))
-    return IrradianceField(
-        mi.Int32(aligned(lattice.shape_first, np.int32)),
-        mi.UInt32(aligned(lattice.lacquered, np.uint32)),
-        mi.UInt32(aligned(faces, np.uint32)),
-        values,
-        share,
-        len(lattice.first),
-    )

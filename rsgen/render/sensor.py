@@ -23,8 +23,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from rsgen.device.lens import Lens, undistort
-from rsgen.device.pose_table import PoseFunction, PoseTable
+from rsgen.device.lens import Lens, PoseFunction, PoseTable, undistort
+from rsgen.device.projection import rotated
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 
@@ -99,6 +99,14 @@ class RollingShutterSensor(mi.Sensor):
         ray.has_differentials = True
         return ray, weight
 
+    def central_rays(self):
+        """u and v of all pixels, row by row, and the rays through their centres at their lines' mid-exposure."""
+        camera = self.camera
+        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
+        u, v = mi.Float(pixel % camera.width), mi.Float(pixel // camera.width)
+        position = mi.Point2f((u + 0.5) / camera.width, (v + 0.5) / camera.height)
+        return u, v, self.sample_ray(0.5 * self.exposure, mi.Float(0), position, mi.Point2f(0.5))[0]
+
     def axes(self, time, sample2):
         """The camera's x, y and z axes in the world at `time` after the lines at film positions `sample2` opened."""
         camera = self.camera
@@ -127,7 +135,7 @@ class RollingShutterSensor(mi.Sensor):
         """Origin and rotation at `t` seconds after the first line's shutter opened."""
         rows = self._poses.at(t)
         origin = mi.Point3f(*(row.w for row in rows))
-        return origin, lambda d: dr.normalize(mi.Vector3f(*(row.x * d.x + row.y * d.y + row.z * d.z for row in rows)))
+        return origin, lambda d: dr.normalize(mi.Vector3f(*rotated(rows, d)))
 
     def _direction(self, u, v):
         """Direction (x, y, 1) in the camera's frame of pixel position (u, v), distortion undone."""

@@ -15,19 +15,24 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+
+from rsgen.array_types import ByteArray, FloatArray, IntArray
 from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.formats import scene_reader, xml_helper
+from rsgen.geometry import se3
+from rsgen.geometry.aprilgrid import AprilGrid
+from rsgen.image_codecs import encode_png
 from rsgen.inputs import check_input
-from rsgen.scene.board import BOARD_ID, Board, board_xml
-from rsgen.scene.meshes import repair_meshes, split_terrain
-from rsgen.scene.placement import AS_IT_IS, SceneOptions, place, place_lamps
+from rsgen.scene.meshes import meshes_of, ply_bytes, repair_meshes, split_terrain
+from rsgen.scene.placement import ANALYTIC, AS_IT_IS, SceneOptions, place, place_lamps, tessellated, turn_mirrored
 from rsgen.scene.xml_scene import (
-    Parsed,
     check_files,
     explained,
     log_renamed,
@@ -37,7 +42,6 @@ from rsgen.scene.xml_scene import (
     prepare,
     unknown_properties,
 )
-from rsgen.scene.xml_shapes import ANALYTIC, tessellated, turn_mirrored
 
 log = logging.getLogger("rsgen")
 
@@ -52,21 +56,17 @@ def load_scene(path: Path, board: Board | None = None, options: SceneOptions = A
     """
     ensure_built(path)
     mi = mitsuba()
-    with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi) as messages:
-        try:
-            if path.suffix.lower() == ".xml":
-                scene = _load_xml(mi, path, Path(scratch), board, messages, options)
-            else:
-                shapes = scene_reader(path.suffix).scene_dict(mi, path, Path(scratch), options)
-                if board is not None:
-                    shapes["target"] = mi.load_string(board_xml(board, Path(scratch)))
-                # Else shapes would be merged, and ordered by memory address.
-                scene = mi.load_dict(shapes, parallel=False, optimize=False)
-        except UserError:
-            raise
-        except Exception as error:  # Mitsuba and trimesh raise whatever their parsers do
-            raise UserError(f"scene {path}: {_first_line(error)}") from None
-    if not any(shape.is_mesh() for shape in scene.shapes()):
+    scratch_folder = tempfile.TemporaryDirectory(prefix="rsgen-scene-")
+    with scratch_folder as scratch, messages_to_log(mi) as messages, _faults_of(path):
+        if path.suffix.lower() == ".xml":
+            scene = _load_xml(mi, path, Path(scratch), board, messages, options)
+        else:
+            shapes = scene_reader(path.suffix).scene_dict(mi, path, Path(scratch), options)
+            if board is not None:
+                shapes["target"] = mi.load_string(board_xml(board, Path(scratch)))
+            # Else shapes would be merged, and ordered by memory address.
+            scene = mi.load_dict(shapes, parallel=False, optimize=False)
+    if not meshes_of(scene):
         raise UserError(f"scene {path}: has no surfaces to render: add a shape")
     return split_terrain(mi, repair_meshes(mi, scene, path))
 
@@ -108,14 +108,8 @@ def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
             raise UserError(f"scene {path}: is malformed ({_first_line(error)}): export it again") from None
     else:
         mi = mitsuba()
-        with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi):
-            try:
-                parsed = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
-            except UserError:
-                raise
-            except Exception as error:
-                raise UserError(f"scene {path}: {_first_line(error)}") from None
-        state, changes = parsed.state, parsed.changes
+        with tempfile.TemporaryDirectory(prefix="rsgen-scene-") as scratch, messages_to_log(mi), _faults_of(path):
+            state, changes, _ = parse(mi, mi.parser.ParserConfig(mi.variant()), path, Path(scratch))
         if changes is not None:
             digest.update(xml_helper("older version").METHOD)
         if options != replace(AS_IT_IS, skip_missing=options.skip_missing):
@@ -137,20 +131,31 @@ def content_hash(path: Path, options: SceneOptions = AS_IT_IS) -> str:
     return digest.hexdigest()
 
 
+@contextmanager
+def _faults_of(path: Path) -> Iterator[None]:
+    """Mitsuba and trimesh raise whatever their parsers do: UserErrors, naming the scene."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"scene {path}: {_first_line(error)}") from None
+
+
 def _load_xml(
     mi: Any, path: Path, scratch: Path, board: Board | None, messages: list[str], options: SceneOptions
 ) -> Any:
     config = mi.parser.ParserConfig(mi.variant())
     # Merging orders meshes by memory address: emitters and shapes would be numbered anew in each process.
     config.merge_meshes = False
-    parsed = parse(mi, config, path, scratch, None if board is None else board_xml(board, scratch))
-    changes = parsed.changes
-    log_renamed(path, parsed.renamed)
+    shape = None if board is None else board_xml(board, scratch)
+    state, changes, renamed = parse(mi, config, path, scratch, shape)
+    log_renamed(path, renamed)
     resolver = mi.file_resolver()
     resolver.prepend(str(path.resolve().parent))
     try:
         with _threads_to_read_with():
-            scene = _instantiated(mi, config, parsed, path, scratch, options)
+            scene = _instantiated(mi, config, state, changes is not None, path, scratch, options)
     finally:
         del resolver[0]  # else the next scene would find what it lacks, an include say, in this one's folder
     if changes is not None:
@@ -174,8 +179,9 @@ def _threads_to_read_with() -> Iterator[None]:
             dr.set_thread_count(before)
 
 
-def _instantiated(mi: Any, config: Any, parsed: Parsed, path: Path, scratch: Path, options: SceneOptions) -> Any:
-    state = parsed.state
+def _instantiated(
+    mi: Any, config: Any, state: Any, upgraded: bool, path: Path, scratch: Path, options: SceneOptions
+) -> Any:
     prepare(mi, config, state, path)
     if options != AS_IT_IS:
         place(mi, state, path, options, BOARD_ID)
@@ -190,7 +196,7 @@ def _instantiated(mi: Any, config: Any, parsed: Parsed, path: Path, scratch: Pat
     check_files(mi, state, path, options.skip_missing)
     if any(node.type == mi.ObjectType.Shape and node.props.plugin_name() == "obj" for node in state.nodes):
         xml_helper("mesh files").read_polygons(mi, state, scratch)
-    if parsed.changes is not None:
+    if upgraded:
         xml_helper("older version").multiply_images(mi, state)
     mi.parser.transform_all(config, state)
     untouched = mi.parser.ParserState(state)  # objects made of it, also by an attempt that fails, stay in the other
@@ -215,3 +221,78 @@ def _made(mi: Any, config: Any, state: Any, path: Path) -> Any:
 def _first_line(error: object) -> str:
     text = " ".join(str(error).split())
     return text if len(text) <= 300 else text[:297] + "..."
+
+
+BOARD_ID = "rsgen_target"  # of its shape in a scene
+_TAG_PX = 100  # ten cells of a tag; a hundredth of a tag is one pixel
+_CELLS, _BORDER_CELLS = 10, 2
+_WHITE, _BLACK = 217, 13  # reflectances of paper and toner, of 255
+
+
+@dataclass(frozen=True)
+class Board:
+    """A calibration board of Kalibr's and where it is: T_world_target (4, 4).
+
+    Drawn as `kalibr_create_target_pdf` does: tags 36h11 with a black border of two cells, and black squares in the
+    corners between them.
+    """
+
+    grid: AprilGrid
+    T_world_target: FloatArray
+
+
+def board_surface(board: Board) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+    """Corners (4, 3) in the world, m, two triangles (2, 3), normals (4, 3), and texture coordinates (4, 2)."""
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    p_target = np.column_stack([unit * board.grid.size_m, np.zeros(4)]) + board.grid.lower_left
+    uv = unit * [1.0, -1.0] + [0.0, 1.0]  # textures are read from the upper row on
+    normals = np.tile(board.T_world_target[:3, 2], (4, 1))
+    return se3.transform(board.T_world_target, p_target), np.array([[0, 1, 2], [0, 2, 3]]), normals, uv
+
+
+def board_drawing(grid: AprilGrid) -> ByteArray:
+    """The whole board (h, w), upper row first, a pixel a hundredth of a tag: reflectances of 255."""
+    gap = round(grid.spacing * _TAG_PX)
+    width, height = (count * _TAG_PX + (count + 3) * gap for count in (grid.columns, grid.rows))
+    image = np.full((height, width), _WHITE, np.uint8)
+    step = _TAG_PX + gap
+    for row in range(grid.rows + 1):
+        for column in range(grid.columns + 1):
+            below, left = gap + row * step, gap + column * step  # of the black square
+            image[height - below - gap : height - below, left : left + gap] = _BLACK
+            if row < grid.rows and column < grid.columns:
+                below, left = below + gap, left + gap
+                image[height - below - _TAG_PX : height - below, left : left + _TAG_PX] = _tag(
+                    row * grid.columns + column
+                )
+    return image
+
+
+def _tag(number: int) -> ByteArray:
+    """A tag (_TAG_PX, _TAG_PX), upright: its code row by row from the upper left, highest bit first, 1 is white."""
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    # OpenCV draws this family upside down.
+    cells = np.rot90(cv2.aruco.generateImageMarker(family, number, _CELLS, borderBits=_BORDER_CELLS), 2)
+    scale = _TAG_PX // _CELLS
+    return np.where(cells > 0, _WHITE, _BLACK).astype(np.uint8).repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def board_xml(board: Board, folder: Path) -> str:
+    """A Mitsuba <shape> of the board, matte, its back grey; its files go into `folder`."""
+    (folder / "board.ply").write_bytes(ply_bytes(*board_surface(board)))
+    (folder / "board.png").write_bytes(encode_png(np.repeat(board_drawing(board.grid)[..., None], 3, axis=2)))
+    return f"""\
+<shape version="3.0.0" type="ply" id="{BOARD_ID}">
+  <string name="filename" value="{folder / "board.ply"}"/>
+  <bsdf type="twosided">
+    <bsdf type="diffuse">
+      <texture type="bitmap" name="reflectance">
+        <string name="filename" value="{folder / "board.png"}"/>
+        <string name="filter_type" value="nearest"/>
+        <boolean name="raw" value="true"/>
+      </texture>
+    </bsdf>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf>
+  </bsdf>
+</shape>
+"""

@@ -74,8 +74,19 @@ def joined_triangles(vertices: Sequence[NDArray], faces: Sequence[NDArray]) -> t
 
 def surface(scene: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
     """All triangles of a scene: vertices (n, 3) in the world frame, metres, and faces (m, 3)."""
-    vertices, faces = zip(*(mesh_arrays(shape) for shape in scene.shapes() if shape.is_mesh()), strict=True)
+    vertices, faces = zip(*map(mesh_arrays, meshes_of(scene)), strict=True)
     return joined_triangles(vertices, faces)
+
+
+def meshes_of(scene: Any) -> list[Any]:
+    """The shapes of a scene that are meshes."""
+    return [shape for shape in scene.shapes() if shape.is_mesh()]
+
+
+def mesh_corners(shape: Any) -> FloatArray:
+    """Corners (m, 3, 3) of one Mitsuba mesh's triangles in the world frame."""
+    vertices, faces = mesh_arrays(shape)
+    return vertices[faces].astype(np.float64)
 
 
 def mesh_arrays(shape: Any) -> tuple[Float32Array, NDArray[np.uint32]]:
@@ -109,6 +120,16 @@ def repair_meshes(mi: Any, scene: Any, path: Path) -> Any:
     if all(number in flat or not shape.is_mesh() for number, shape in enumerate(scene.shapes())):
         raise UserError(f"scene {path}: no triangle of it has an area: export its meshes anew")
     return rebuilt(mi, scene, flat) if changed or flat else scene
+
+
+def grid_faces(rows: int, columns: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Row and column (n,) of each square of a grid whose (rows + 1) x (columns + 1) vertices are numbered row by row,
+    and the squares' triangles (2 n, 3), of all of them the first halves first.
+    """
+    i, j = (axis.ravel() for axis in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    p = i * (columns + 1) + j
+    q = p + columns + 1
+    return i, j, np.concatenate([np.stack([p, q, q + 1], -1), np.stack([p, q + 1, p + 1], -1)])
 
 
 def rebuilt(mi: Any, scene: Any, left_out: Collection[int] = ()) -> Any:
@@ -168,9 +189,6 @@ def vertex_normals(vertices: Float32Array, faces: NDArray, otherwise: tuple[floa
     return np.where(length > 0, total / np.where(length > 0, length, 1), otherwise)
 
 
-log = logging.getLogger("rsgen")
-
-
 def inhabited_box(shapes: Sequence[Any]) -> FloatArray:
     """Least and largest corner (2, 3), world, m, of all meshes that are no terrain; of all if there is nothing else."""
     every = [_vertices(shape) for shape in shapes]
@@ -186,7 +204,7 @@ def coarser(corners: FloatArray, box: FloatArray) -> FloatArray:
 
 def split_terrain(mi: Any, scene: Any) -> Any:
     """The scene with the triangles of its terrain in parts, if it has any; meshes are changed in place."""
-    shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    shapes = meshes_of(scene)
     terrain = [_across(_vertices(shape)) > _BUILDING_M for shape in shapes]
     if all(terrain):
         return scene  # with nothing that it is around

@@ -22,7 +22,8 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.device.arrays import aligned
-from rsgen.device.pose_table import PoseTable
+from rsgen.device.lens import PoseTable
+from rsgen.device.projection import rotated, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
@@ -174,7 +175,7 @@ class ObjectsInFrame:
             si = hit.compute_surface_interaction(own, mi.RayFlags.All, here)
             n = si.sh_frame.n
             n = dr.select(dr.dot(n, own.d) < 0, n, -n)
-            basis = harmonics(_rotated(rows, n))
+            basis = harmonics(rotated(rows, n))
             ends = [
                 [sum(b * dr.gather(mi.Float, table, mi.UInt32(e * HARMONICS * 3 + 3 * j + c))
                      for j, b in enumerate(basis)) for c in range(3)]
@@ -207,15 +208,15 @@ class ObjectsInFrame:
         Given in the frame of the object `number` - 1; where number is 0 they stay what they are.
         """
         rows = self._carried.at(t, beyond=True, number=number)
-        moved = mi.Point3f(*(a + row.w for a, row in zip(_rotated(rows, p), rows, strict=True)))
-        return moved, mi.Normal3f(*_rotated(rows, normal))
+        moved = mi.Point3f(*(a + row.w for a, row in zip(rotated(rows, p), rows, strict=True)))
+        return moved, mi.Normal3f(*rotated(rows, normal))
 
     def openness(self, p_world: Any, n_world: Any, time: Any) -> Any:
         """Share of its light that a surface point keeps, `time` seconds after the stamp; n_world: the lit side's."""
         open_ = mi.Float(1)
         for thing, poses in zip(self._objects, self._poses, strict=True):
             rows = poses.at(time + self._exposure_s)
-            p, n = _rotated_back(rows, p_world - _origin(rows)), _rotated_back(rows, n_world)
+            p, n = rotated_back(rows, p_world - _origin(rows)), rotated_back(rows, n_world)
             middle, axes = thing.mesh.middle.tolist(), thing.mesh.axes.tolist()
             away = [(m - x) / a for m, x, a in zip(middle, p, axes, strict=True)]
             scaled = dr.normalize(mi.Vector3f(*(x * a for x, a in zip(n, axes, strict=True))))
@@ -251,8 +252,8 @@ class ShadedField:
 
 def _own_ray(thing: MovingObject, rows: Rows, ray: Any, most: Any) -> tuple[Any, Any]:
     """Rays in the object's own frame, and whether they come near it within `most`."""
-    o = mi.Point3f(*_rotated_back(rows, ray.o - _origin(rows)))
-    d = mi.Vector3f(*_rotated_back(rows, ray.d))
+    o = mi.Point3f(*rotated_back(rows, ray.o - _origin(rows)))
+    d = mi.Vector3f(*rotated_back(rows, ray.d))
     to_middle = mi.Point3f(*thing.mesh.middle.tolist()) - o
     along = dr.dot(to_middle, d)
     radius = thing.mesh.radius * (1 + 1e-4)
@@ -263,16 +264,6 @@ def _own_ray(thing: MovingObject, rows: Rows, ray: Any, most: Any) -> tuple[Any,
 
 def _origin(rows: Rows) -> Any:
     return mi.Point3f(*(row.w for row in rows))
-
-
-def _rotated(rows: Rows, v: Any) -> tuple[Any, Any, Any]:
-    x, y, z = (row.x * v.x + row.y * v.y + row.z * v.z for row in rows)
-    return x, y, z
-
-
-def _rotated_back(rows: Rows, v: Any) -> tuple[Any, Any, Any]:
-    a, b, c = rows
-    return (a.x * v.x + b.x * v.y + c.x * v.z, a.y * v.x + b.y * v.y + c.y * v.z, a.z * v.x + b.z * v.y + c.z * v.z)
 
 
 def _settle(*values: Any) -> None:

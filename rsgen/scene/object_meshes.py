@@ -17,7 +17,7 @@ from rsgen.device.backend import mitsuba
 from rsgen.errors import UserError
 from rsgen.formats import scene_reader
 from rsgen.scene.material import Material, bsdf
-from rsgen.scene.meshes import joined_triangles, ply_bytes, repair_meshes, surface
+from rsgen.scene.meshes import grid_faces, joined_triangles, ply_bytes, repair_meshes, surface
 from rsgen.scene.placement import SceneOptions
 
 _SEGMENTS = 96  # squares around a ball or cylinder, at least
@@ -150,7 +150,5 @@ def _sheet(rows: int, columns: int, cut: int) -> tuple[FloatArray, FloatArray, I
     """
     m, n = int(rows) * cut, int(columns) * cut
     a, b = (grid.ravel() for grid in np.meshgrid(np.arange(m + 1) / m, np.arange(n + 1) / n, indexing="ij"))
-    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(m), np.arange(n), indexing="ij"))
-    p = i * (n + 1) + j
-    faces = np.concatenate([np.stack([p, p + n + 1, p + n + 2], -1), np.stack([p, p + n + 2, p + 1], -1)])
+    i, j, faces = grid_faces(m, n)
     return a, b, faces, np.tile((i // cut + j // cut) % 2 == 1, 2)

@@ -11,7 +11,6 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -21,7 +20,7 @@ import numpy as np
 from rsgen.errors import UserError, first_few
 from rsgen.formats import xml_helper
 from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
-from rsgen.scene.xml_shapes import children, flatten
+from rsgen.scene.placement import children, flatten, pose_of
 
 log = logging.getLogger("rsgen")
 
@@ -31,19 +30,9 @@ _UNKNOWN = re.compile(r'(\w+) plugin of type "(\w+)":|- \w+ "(\w+)"')
 _FAILED = re.compile(r'At (.*?\(line \d+, col \d+\)): failed to instantiate (\w+) plugin of type "(\w+)": (.*)')
 
 
-@dataclass(frozen=True)
-class Parsed:
+def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> tuple[Any, Any, dict[str, str]]:
     """A scene file's parsed state, what an upgrade changed if it is older than Mitsuba 3 (None: it is not), and files
     that it names otherwise than they are called, by the names there.
-    """
-
-    state: Any
-    changes: Any
-    renamed: dict[str, str]
-
-
-def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = None) -> Parsed:
-    """A scene file parsed.
 
     config: a ParserConfig; scratch: a folder for files made on the way; shape: XML of one more shape, which is added as
     the last. Raises UserError, and what Mitsuba's parser raises.
@@ -62,7 +51,7 @@ def parse(mi: Any, config: Any, path: Path, scratch: Path, shape: str | None = N
         file = whole
     state = mi.parser.parse_file(config, str(file))
     renamed = {} if changes is None else changes.renamed
-    return Parsed(state, changes, renamed | repair_names(state, path.parent))
+    return state, changes, renamed | repair_names(state, path.parent)
 
 
 def older_version(path: Path) -> str | None:
@@ -94,7 +83,7 @@ def prepare(mi: Any, config: Any, state: Any, path: Path) -> None:
     for node in state.nodes:
         props = node.props
         if node.type == mi.ObjectType.Shape and "to_world" in props:
-            pose = np.asarray(props["to_world"].matrix, float).reshape(4, 4)
+            pose = pose_of(props)
             linear, size = pose[:3, :3], float(np.linalg.norm(pose[:3, :3]))
             if not np.isfinite(pose).all() or abs(float(np.linalg.det(linear))) <= 1e-12 * size**3:
                 what = props.id() or props.plugin_name()

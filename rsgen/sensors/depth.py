@@ -1,23 +1,23 @@
-"""Models of depth cameras: exact planar depth to what a structured-light or time-of-flight camera reports.
+"""Models of depth cameras: exact planar depth to what a structured-light, time-of-flight or stereo camera reports.
 
 Depth images are (h, w) float32, planar z in metres, 0 where nothing is measured. Disparity is that of a camera and a
 projector (or second camera) at a baseline b: d = b f / z with f = fx, in px. On a plane it is affine in the pixel, so
-it is what is interpolated and searched for edges. What an exposure, or a faulty device, does to depth comes before all
-this: `rsgen.sensors.depth`.
+it is what is interpolated and searched for edges. What an exposure, or a faulty device, does to depth comes before the
+noise. A stereo camera's depth is computed from its images, as it does itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import BoolArray, Float32Array, FloatArray
+from rsgen.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from rsgen.config.cameras import DepthNoiseConfig
+from rsgen.config.rig import StereoConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sensors.seed import device_generator
@@ -33,7 +33,7 @@ def apply_depth_noise(
 ) -> Float32Array:
     """What the depth camera reports (h, w) for exact planar depth `z` (h, w): metres, 0 = no return.
 
-    `shadow` (h, w): where the projector's light does not reach (`rsgen.sensors.shadow`), used by the model 'kinect'.
+    `shadow` (h, w): where the projector's light does not reach (see `Projector`), used by the model 'kinect'.
     `rng` decides every random number of the frame.
     """
     if config.model == "none":
@@ -63,7 +63,7 @@ def _kinect(z: Float32Array, camera: Camera, config: DepthNoiseConfig, rng: np.r
     lost = grazing_probability(incidence(d, camera), *config.grazing_deg)
     lost = np.where(edge, 1 - (1 - lost) * np.float32(1 - config.edge_dropout), lost)
     kept = (noisy > 0) & (rng.random(z.shape, np.float32) >= lost)
-    return np.where(kept, np.float32(focal_baseline) / np.where(kept, noisy, 1), np.float32(0))
+    return disparity(np.where(kept, noisy, np.float32(0)), focal_baseline)
 
 
 def _time_of_flight(
@@ -90,8 +90,11 @@ def smooth_field(shape: tuple[int, ...], length_px: float, rng: np.random.Genera
     return smooth[margin:-margin, margin:-margin] * np.float32(2 * np.sqrt(np.pi) * sigma)
 
 
-def disparity(z: Float32Array, focal_baseline: float) -> Float32Array:
-    """Disparity (h, w) in px of planar depth z (h, w) in m, `focal_baseline` in m·px (a Kinect's: 43); 0 of 0."""
+def disparity(z: Float32Array, focal_baseline: float | np.float32) -> Float32Array:
+    """Disparity (h, w) in px of planar depth z (h, w) in m, `focal_baseline` in m·px (a Kinect's: 43); 0 of 0.
+
+    Depth of disparity likewise.
+    """
     return np.where(z > 0, np.float32(focal_baseline) / np.where(z > 0, z, 1), np.float32(0))
 
 
@@ -147,13 +150,13 @@ def incidence(d: Float32Array, camera: Camera) -> Float32Array:
     C = d − A x − B y, cos θ = d / (|(A, B, C)| |(x, y, 1)|). Slopes are one-sided differences, of two the
     smaller, which keeps to one side of an edge. Rows are treated as if all had one pose.
     """
-    rays = _rays(camera)
+    x, y, length, u_x, u_y, v_x, v_y = _rays(camera)
     slope_u, slope_v = _slope(d, 1), _slope(d, 0)
-    A = rays.u_x * slope_u + rays.v_x * slope_v
-    B = rays.u_y * slope_u + rays.v_y * slope_v
-    C = d - A * rays.x - B * rays.y
+    A = u_x * slope_u + v_x * slope_v
+    B = u_y * slope_u + v_y * slope_v
+    C = d - A * x - B * y
     normal = np.sqrt(A * A + B * B + C * C)
-    cosine = np.where(d > 0, d / (np.where(d > 0, normal, 1) * rays.length), 0)
+    cosine = np.where(d > 0, d / (np.where(d > 0, normal, 1) * length), 0)
     return np.arccos(np.minimum(cosine, 1, dtype=np.float32))
 
 
@@ -197,25 +200,13 @@ def mix_edges(z: Float32Array, edge: BoolArray, probability: float, rng: np.rand
     return mixed
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """Per pixel (h, w): ray (x, y, 1), its length, and the derivatives of pixel (u, v) by (x, y), px."""
-
-    x: Float32Array
-    y: Float32Array
-    length: Float32Array
-    u_x: Float32Array
-    u_y: Float32Array
-    v_x: Float32Array
-    v_y: Float32Array
-
-
 @lru_cache(maxsize=4)
-def _rays(camera: Camera) -> _Rays:
+def _rays(camera: Camera) -> list[Float32Array]:
+    """Per pixel (h, w): x, y of the ray (x, y, 1), its length, and the pixel's derivatives u_x, u_y, v_x, v_y, px."""
     rays = camera.unproject(camera.pixel_grid())
-    J = camera.project_jacobian(rays)
-    parts = (rays[..., 0], rays[..., 1], np.linalg.norm(rays, axis=-1), J[..., 0, 0], J[..., 0, 1], J[..., 1, 0])
-    return _Rays(*(np.ascontiguousarray(part, np.float32) for part in (*parts, J[..., 1, 1])))
+    J = camera.project_jacobian(rays)[..., :2].reshape(*rays.shape[:2], 4)
+    parts = (*np.moveaxis(rays[..., :2], -1, 0), np.linalg.norm(rays, axis=-1), *np.moveaxis(J, -1, 0))
+    return [np.ascontiguousarray(part, np.float32) for part in parts]
 
 
 def _slope(d: Float32Array, axis: int) -> Float32Array:
@@ -243,7 +234,7 @@ def with_fixed_errors(z: Float32Array, camera: Camera, config: DepthNoiseConfig,
         camera.width, camera.height, config.distortion_px, config.distortion_period_px, config.pattern_px, seed
     )
     d = np.where(z > 0, focal_baseline / np.where(z > 0, z, 1) + delta, np.float32(0))
-    return np.where(d > 0, np.float32(1 + config.scale_error) * focal_baseline / np.where(d > 0, d, 1), np.float32(0))
+    return disparity(d, np.float32(1 + config.scale_error) * focal_baseline)
 
 
 @lru_cache(maxsize=2)
@@ -278,11 +269,10 @@ def mixed_depth(samples: Sequence[Float32Array], flying: bool) -> Float32Array:
     seen = z > 0
     if flying:
         return np.where(seen.any(0), z.sum(0) / np.maximum(seen.sum(0), 1), np.float32(0)).astype(np.float32)
-    inverse = np.where(seen, 1 / np.where(seen, z, 1), np.float32(0))
+    inverse = disparity(z, 1)
     middle = np.sort(inverse, axis=0)[len(samples) // 2]
     one_surface = (inverse.max(0) - inverse.min(0)) < np.float32(_ONE_SURFACE) * middle
-    found = np.where(one_surface, inverse.mean(0), middle)
-    return np.where(found > 0, 1 / np.where(found > 0, found, 1), np.float32(0)).astype(np.float32)
+    return disparity(np.where(one_surface, inverse.mean(0), middle), 1).astype(np.float32)
 
 
 def register_depth(
@@ -305,3 +295,31 @@ def register_depth(
     buffer = np.full(color.height * color.width, np.inf, np.float32)
     np.minimum.at(buffer, place, p_color[inside, 2].astype(np.float32))
     return np.where(np.isfinite(buffer), buffer, np.float32(0)).reshape(color.height, color.width)
+
+
+# OpenCV reports disparities in these parts of a pixel, and the penalties that its documentation recommends.
+_PARTS, _P1, _P2 = 16, 8, 32
+# Its matching cost draws disparities towards whole pixels: depth in steps. In images of twice the width these are half
+# as wide, and so is the error of the disparity (docs/notebook/rigs.md).
+_WIDER = 2
+
+
+def stereo_depth(left: ByteArray, right: ByteArray, focal_baseline: float, config: StereoConfig) -> Float32Array:
+    """Planar z (h, w) in m of the left image's pixels, 0 where no match is sure; images (h, w), rows alike.
+
+    focal_baseline: focal length in px times the distance of the cameras in m. Left and right are checked against each
+    other, so that what only one of them sees has no depth. Semi-global matching: Hirschmüller, "Stereo Processing by
+    Semiglobal Matching and Mutual Information", PAMI 2008, in OpenCV's variant.
+    """
+    area, largest = config.block_px**2, _WIDER * config.disparities
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0, numDisparities=largest, blockSize=config.block_px, P1=_P1 * area, P2=_P2 * area,
+        disp12MaxDiff=1, uniquenessRatio=config.uniqueness_pct, speckleWindowSize=_WIDER * config.speckle_px,
+        speckleRange=1 if config.speckle_px else 0, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    wide = [cv2.resize(image, None, fx=_WIDER, fy=1, interpolation=cv2.INTER_CUBIC) for image in (left, right)]
+    # The leftmost pixels would have no disparity otherwise: a margin as wide as disparities are large.
+    padded = [cv2.copyMakeBorder(image, 0, 0, largest, 0, cv2.BORDER_CONSTANT) for image in wide]
+    d = matcher.compute(*padded)[:, largest::_WIDER].astype(np.float32) / (_PARTS * _WIDER)
+    # What is matched to the margin has been matched to nothing.
+    return disparity(np.where(np.arange(left.shape[1]) - d >= 0, d, np.float32(0)), focal_baseline)

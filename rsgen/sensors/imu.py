@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from rsgen.array_types import FloatArray
 from rsgen.config.faults import ImuFaults
-from rsgen.config.imu import ImuConfig, Vector3
+from rsgen.config.sections import ImuConfig, Vector3
 from rsgen.errors import UserError
 from rsgen.files import atomic_write
 from rsgen.geometry import se3
@@ -144,12 +144,15 @@ def write_imu_csv(path: Path, samples: ImuSamples, epoch_s: int = 0) -> None:
 
 def imu_csv(samples: ImuSamples, epoch_s: int = 0) -> str:
     """Samples as the text of EuRoC's imu0/data.csv: whole nanoseconds, rad/s, m/s². `epoch_s` is added to all times."""
-    stamps = nanoseconds(samples.stamps, epoch_s)
-    lines = [
-        ",".join([str(stamp), *(f"{value:.12g}" for value in row)])
-        for stamp, row in zip(stamps, np.column_stack([samples.gyro, samples.accel]).tolist(), strict=True)
-    ]
-    return "\n".join([IMU_CSV_HEADER, *lines, ""])
+    values = np.column_stack([samples.gyro, samples.accel])
+    return _csv(IMU_CSV_HEADER, nanoseconds(samples.stamps, epoch_s), values=values)
+
+
+def _csv(header: str, *times: list[int], values: FloatArray) -> str:
+    """Lines of times, ns, n each, and values (n, k)."""
+    rows = zip(*times, values.tolist(), strict=True)
+    lines = (",".join([*map(str, stamps), *(f"{value:.12g}" for value in row)]) for *stamps, row in rows)
+    return "\n".join([header, *lines, ""])
 
 
 def nanoseconds(t: npt.ArrayLike, epoch_s: int = 0) -> list[int]:
@@ -219,12 +222,8 @@ _MATRICES = "gyroscope_matrix", "accelerometer_matrix"
 
 def imu_truth_csv(samples: ImuSamples) -> str:
     """Text of truth/imu.csv."""
-    biases = np.column_stack([samples.gyro_bias, samples.accel_bias]).tolist()
-    lines = [
-        ",".join([str(taken), str(stamp), *(f"{value:.12g}" for value in row)])
-        for taken, stamp, row in zip(nanoseconds(samples.t), nanoseconds(samples.stamps), biases, strict=True)
-    ]
-    return "\n".join([IMU_TRUTH_HEADER, *lines, ""])
+    biases = np.column_stack([samples.gyro_bias, samples.accel_bias])
+    return _csv(IMU_TRUTH_HEADER, nanoseconds(samples.t), nanoseconds(samples.stamps), values=biases)
 
 
 def imu_truth_yaml(

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from rsgen.array_types import FloatArray
@@ -31,6 +33,12 @@ class Cameras:
     depth_shutter: Shutter
     depth_scale: float
     T_color_depth: FloatArray
+
+    @classmethod
+    def of(cls, color: Any, depth: Any, T_color_depth: npt.ArrayLike) -> Cameras:
+        """Of streams that have a camera and a shutter, depth a scale: of a config or of a sequence."""
+        sensors = color.camera, color.shutter, depth.camera, depth.shutter
+        return cls(*sensors, depth.depth_scale, np.array(T_color_depth, float))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What writer and reader of a sequence folder agree on: sequence.yaml, stamps, pairs, and poses as TUM rows.
+"""What writer and reader of a sequence folder agree on: sequence.yaml, files' places, stamps, pairs, poses as TUM rows.
 
 Format 1 has two cameras, colour and depth; format 2 a rig of any cameras with their poses in a body (docs/format.md).
 """
@@ -6,6 +6,7 @@ Format 1 has two cameras, colour and depth; format 2 a rig of any cameras with t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
@@ -292,3 +293,51 @@ def ground_truth(spline: Spline, *stamps: npt.ArrayLike, T_cam_body: FloatArray 
     times = times[(times >= spline.t_begin) & (times <= spline.t_end)]
     T = spline.pose(times)
     return np.column_stack([times, pose_rows(T if T_cam_body is None else T @ se3.inverse(T_cam_body))])
+
+
+@dataclass(frozen=True)
+class StreamFiles:
+    """Paths within the folder. truth: in which each kind of exact image has a folder; exact_depth: of depth cameras."""
+
+    images: str
+    listing: str
+    rows: str
+    frame_table: str
+    truth: str
+    exact_depth: str
+    object_ids: str
+    labels: str
+    boxes: str
+
+    def truth_image(self, name: str, channels: Sequence[str], stem: str) -> str:
+        """File of an exact image; without EXR channels it is a PNG."""
+        return f"{self.truth}/{name}/{stem}.{'exr' if channels else 'png'}"
+
+
+FILES = {
+    "color": StreamFiles(
+        "rgb", "rgb.txt", "truth/rows_color.npy", "truth/frames_color.txt", "truth", "", "truth/object_ids",
+        "truth/labels", "truth/boxes_color.csv",
+    ),
+    "depth": StreamFiles(
+        "depth", "depth.txt", "truth/rows_depth.npy", "truth/frames_depth.txt", "truth", "truth/depth",
+        "truth/depth_object_ids", "truth/depth_labels", "truth/boxes_depth.csv",
+    ),
+}  # fmt: skip
+"""Of a sequence of format 1."""
+
+
+def rig_files(name: str) -> StreamFiles:
+    """Of a camera of a rig, format 2."""
+    truth = f"truth/{name}"
+    return StreamFiles(
+        name,
+        f"{name}.txt",
+        f"{truth}/rows.npy",
+        f"{truth}/frames.txt",
+        truth,
+        f"{truth}/depth",
+        f"{truth}/object_ids",
+        f"{truth}/labels",
+        f"{truth}/boxes.csv",
+    )

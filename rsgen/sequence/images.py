@@ -18,10 +18,8 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import read_exr, read_npy, read_png
 from rsgen.sequence.camera_yaml import read_true_cameras
-from rsgen.sequence.format import IMAGE_KINDS, OBJECT_CHANNELS, StreamKind, poses_of_rows
-from rsgen.sequence.labels import LABELS, Label, read_labels
-from rsgen.sequence.stream_files import StreamFiles
-from rsgen.sequence.truth_files import FrameTable, SequenceObject
+from rsgen.sequence.format import IMAGE_KINDS, OBJECT_CHANNELS, StreamFiles, StreamKind, poses_of_rows
+from rsgen.sequence.truth_files import LABELS, FrameTable, Label, SequenceObject, read_labels
 
 COLOR_DEPTH = "color_depth"
 """Exact image of a colour camera: planar z, m."""
@@ -103,17 +101,13 @@ class Rig:
         camera = self.image_camera(stream)
         return read_png(self.streams[stream].paths[k], (camera.height, camera.width), np.uint16)
 
-    def exact_depth_path(self, stream: str, k: int) -> Path:
-        """File of `exact_depth`."""
-        s = self.streams[stream]
-        return self.root / s.files.exact_depth / s.paths[k].with_suffix(".exr").name
-
     def exact_depth(self, stream: str, k: int) -> Float32Array:
         """Exact planar z (h, w) in metres that a depth camera has before its errors; 0 where there is none."""
-        camera = self.streams[stream].camera
-        z = read_exr(self.exact_depth_path(stream, k), (camera.height, camera.width))
+        s = self.streams[stream]
+        path = self.root / s.files.exact_depth / s.paths[k].with_suffix(".exr").name
+        z = read_exr(path, (s.camera.height, s.camera.width))
         if not (np.isfinite(z).all() and (z >= 0).all()):
-            raise UserError(f"{self.exact_depth_path(stream, k)}: holds negative or non-finite depths: render it again")
+            raise UserError(f"{path}: holds negative or non-finite depths: render it again")
         return z
 
     def exact_image(self, stream: str, name: str, k: int) -> npt.NDArray[Any]:
@@ -172,6 +166,11 @@ class Rig:
         """Exact poses T_world_cam (..., 4, 4) with which image k was taken at pixels uv (..., 2): their lines'."""
         line = np.rint(np.asarray(uv)[..., self.streams[stream].shutter.axis]).astype(np.int64)
         return poses_of_rows(self.rows(stream)[k])[line]
+
+    @cached_property
+    def as_taken(self) -> Rig:
+        """The same with the cameras that took it: only those of a `Sequence` may be declared otherwise."""
+        return self
 
     def seen_from(self, camera: str) -> Rig:
         """The same with a camera as the body: spline and poses are of it. Itself, if it is the body."""
@@ -269,10 +268,6 @@ class Sequence(Rig):
     def truth_depth(self, k: int) -> Float32Array:
         """Exact planar z (h, w) in metres, noise-free, with the same rolling shutter; 0 where there is none."""
         return self.exact_depth("depth", k)
-
-    def truth_depth_path(self, k: int) -> Path:
-        """File of `truth_depth(k)`."""
-        return self.exact_depth_path("depth", k)
 
     @property
     def truth_images(self) -> dict[str, tuple[str, ...]]:

@@ -1,4 +1,4 @@
-"""Sequence folders: read one, strictly.
+"""Sequence folders: read one, strictly, and say what it holds.
 
 sequence = read_sequence(Path("out/lr_kt2"))
 z, rows = sequence.depth(0), sequence.rows("depth")[0]     # metres (h, w); T_world_depth of each line (h, 7)
@@ -19,18 +19,21 @@ from rsgen.files import listed_file, read_text
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.limits import rigid
+from rsgen.sequence.camera_yaml import TRUE_CAMERAS
 from rsgen.sequence.format import (
+    FILES,
     STAMP_TOLERANCE_S,
     Line,
     RigStreamYaml,
     RigYaml,
+    StreamFiles,
     StreamKind,
     StreamYaml,
     parse_listing,
     read_sequence_yaml,
+    rig_files,
 )
 from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.sequence.stream_files import FILES, StreamFiles, rig_files
 from rsgen.sequence.truth_files import FrameTable, read_frame_table, read_objects
 
 _LONGEST_S = 1e6  # as long as stamps may grow
@@ -67,8 +70,7 @@ def read_rig(path: Path) -> Rig:
             "depth": _read_stream(root, "depth", both.depth, FILES["depth"], "depth", np.eye(4), {}),
         }
     spline = _read_spline(root / "spline.npz", streams)
-    span = (f(s.stamps[k] for s in streams.values()) for f, k in ((min, 0), (max, -1)))
-    objects = read_objects(root, description.objects, *map(float, span)) if description.objects else ()
+    objects = read_objects(root, description.objects, *_span(streams)) if description.objects else ()
     if isinstance(description, RigYaml):
         return Rig(root, description.name, streams, spline, meta, objects)
     return Sequence(root, description.name, streams, spline, meta, objects, T_color_depth)
@@ -86,11 +88,15 @@ def _rig_stream(root: Path, name: str, yaml: RigStreamYaml) -> ImageStream:
     return _read_stream(root, name, yaml, rig_files(name), yaml.kind, se3.inverse(T_body_cam), yaml.truth)
 
 
+def _span(streams: dict[str, ImageStream]) -> tuple[float, float]:
+    """First and last stamp of all images, s."""
+    return min(float(s.stamps[0]) for s in streams.values()), max(float(s.stamps[-1]) for s in streams.values())
+
+
 def _read_spline(path: Path, streams: dict[str, ImageStream]) -> Spline:
     """The spline, which has to cover the frames and not much more: a huge knot spacing would take all memory."""
     spline = Spline.load(path)
-    first = min(stream.stamps[0] for stream in streams.values())
-    last = max(stream.stamps[-1] for stream in streams.values())
+    first, last = _span(streams)
     if not (spline.t_begin - STAMP_TOLERANCE_S <= first and last <= spline.t_end + STAMP_TOLERANCE_S):
         raise UserError(
             f"{path}: covers {spline.t_begin:g} to {spline.t_end:g} s, the frames {first:g} to {last:g} s: "
@@ -151,3 +157,42 @@ def _frame_number(listing: Path, line: Line, yaml: StreamYaml) -> int:
     if not (stem.isascii() and stem.isdigit() and len(stem) <= 9 and int(stem) < yaml.frames):
         raise UserError(f"{where}: {line.path!r} is not one of the sequence's {yaml.frames} frames")
     return int(stem)
+
+
+def sequence_info(path: Path) -> str:
+    """Text for `rsgen info`: what is in a sequence folder. Raises UserError."""
+    sequence = read_rig(path)
+    knots = sequence.spline
+    rows = [("name", sequence.name)]
+    for name, s in sequence.streams.items():
+        frames = f"{len(s.paths)} frames" if len(s.paths) == s.frames else f"{len(s.paths)} of {s.frames} frames"
+        scale = f", {s.depth_scale:g} units per metre" if s.depth_scale else ""
+        kind = "" if name == s.kind else f"{s.kind}, "
+        c = s.camera
+        rows += [
+            (name, f"{kind}{frames} at {s.rate_hz:g} Hz, {s.stamps[0]:.3f} to {s.stamps[-1]:.3f} s"),
+            ("", f"{c.width}x{c.height} {c.model}, fx {c.fx:g} fy {c.fy:g} cx {c.cx:g} cy {c.cy:g}{scale}"),
+            ("", _shutter_text(s)),
+        ]
+    first, last = _span(sequence.streams)
+    times = np.linspace(first, last, min(max(2, round((last - first) * 1000)), 1_000_000))
+    p_world = knots.pose(np.clip(times, knots.t_begin, knots.t_end))[:, :3, 3]
+    length = np.linalg.norm(np.diff(p_world, axis=0), axis=1).sum()
+    size = sum(file.stat().st_size for file in sequence.root.rglob("*") if file.is_file())
+    if sequence.meta.get("declared"):
+        rows.append(("declared", f"cameras are claims, not the truth, which {TRUE_CAMERAS} has"))
+    if sequence.objects:
+        rows.append(("objects", ", ".join(thing.name for thing in sequence.objects)))
+    rows += [
+        ("duration", f"{last - first:.3f} s"),
+        ("trajectory", f"{length:.3f} m, {len(knots.control_points)} control points every {knots.dt * 1000:g} ms"),
+        ("noise", str(sequence.meta.get("noise") or "none")),
+        ("on disk", f"{size / 1e6:.1f} MB"),
+    ]
+    return "\n".join(f"{label:<11} {text}" for label, text in rows)
+
+
+def _shutter_text(stream: ImageStream) -> str:
+    shutter, delay = stream.shutter, stream.shutter.line_delay(stream.camera)
+    rolling = f"readout {shutter.readout_s * 1000:g} ms {shutter.scan}, line delay {delay * 1e6:.3f} us"
+    return f"{rolling if shutter.readout_s else 'global shutter'}, exposure {shutter.exposure_s * 1000:g} ms"

@@ -13,12 +13,13 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from rsgen.array_types import BoolArray, FloatArray, IntArray
+from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.inputs import check_input
 
 TrajectoryFormat = Literal["auto", "tum", "icl", "euroc"]
+Check = Callable[[BoolArray, Callable[[int], str]], None]
 
 ICL_RATE_HZ = 30.0
 """ICL-NUIM's files carry frame indices only; its sequences are 30 Hz by definition."""
@@ -30,9 +31,9 @@ MAX_POSITION_M = 1e4
 """Positions farther than this from the origin are refused: millimetres, or map coordinates, by mistake."""
 
 MIN_POSES = 4
-_MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
+MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
 _ICL_Z_OFFSET_M = -2.25  # the published files put frame 1 at z = -2.25
-_FIELDS = {"tum": 8, "icl": 8, "euroc": 8}
+_FIELDS = 8
 _LAYOUT = {
     "tum": "'stamp tx ty tz qx qy qz qw'",
     "icl": "'frame tx ty tz qx qy qz qw'",
@@ -114,9 +115,12 @@ def read_trajectory(
     records = _records(path, _text(path))
     kind = _detect(path, records) if format == "auto" else format
 
-    lines = np.array([line for line, _ in records])
+    def check(good: BoolArray, complaint: Callable[[int], str]) -> None:
+        """Raises UserError for the first record that is not good."""
+        for bad in np.flatnonzero(~good)[:1]:
+            raise UserError(f"{path}:{records[bad][0]}: {complaint(int(bad))}")
+
     table = _table(path, kind, records)
-    check = _Checker(path, lines)
     stamps = table[:, 0]
     check(np.all(np.isfinite(table), axis=1), lambda i: "has a NaN or infinite value: remove the line")
     positions, quaternions = table[:, 1:4], table[:, 4:8]
@@ -130,7 +134,7 @@ def read_trajectory(
         )
         stamps = stamps / ICL_RATE_HZ
     check(
-        np.abs(stamps) < _MAX_STAMP_S,
+        np.abs(stamps) < MAX_STAMP_S,
         lambda i: f"has the stamp {stamps[i]:.6g}, absurd in seconds: divide by 1e9 if these are nanoseconds",
     )
     _check_stamps(check, stamps, max_gap_s)
@@ -191,26 +195,19 @@ def _detect(path: Path, records: list[tuple[int, str]]) -> Literal["tum", "icl",
 
 def _table(path: Path, kind: str, records: list[tuple[int, str]]) -> FloatArray:
     """(n, 8) float64: the first eight columns."""
-    wanted = _FIELDS[kind]
     rows = []
     for line, content in records:
         fields = content.split(",") if kind == "euroc" else content.replace(",", " ").split()
-        if len(fields) < wanted or (len(fields) > wanted and kind != "euroc"):
-            raise UserError(f"{path}:{line}: {len(fields)} columns instead of {wanted}, expected {_LAYOUT[kind]}")
-        try:
-            rows.append([float(field) for field in fields[:wanted]])
-        except ValueError:
-            bad = next(field for field in fields if not _is_number(field))
-            raise UserError(f"{path}:{line}: '{bad.strip()[:30]}' is not a number, expected {_LAYOUT[kind]}") from None
+        if len(fields) < _FIELDS or (len(fields) > _FIELDS and kind != "euroc"):
+            raise UserError(f"{path}:{line}: {len(fields)} columns instead of {_FIELDS}, expected {_LAYOUT[kind]}")
+        rows.append(np.empty(_FIELDS))
+        for k, field in enumerate(fields[:_FIELDS]):
+            try:
+                rows[-1][k] = float(field)
+            except ValueError:
+                what = f"'{field.strip()[:30]}' is not a number"
+                raise UserError(f"{path}:{line}: {what}, expected {_LAYOUT[kind]}") from None
     return np.array(rows)
-
-
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
 
 
 def _nanoseconds(path: Path, records: list[tuple[int, str]]) -> FloatArray:
@@ -227,20 +224,7 @@ def _nanoseconds(path: Path, records: list[tuple[int, str]]) -> FloatArray:
 # --- checks on numbers -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Checker:
-    """Raises UserError for the first record whose entry in an (n,) bool array is false."""
-
-    path: Path
-    lines: IntArray
-
-    def __call__(self, good: BoolArray, complaint: Callable[[int], str]) -> None:
-        bad = np.flatnonzero(~good)
-        if bad.size:
-            raise UserError(f"{self.path}:{self.lines[bad[0]]}: {complaint(int(bad[0]))}")
-
-
-def _check_stamps(check: _Checker, stamps: FloatArray, max_gap_s: float | None) -> None:
+def _check_stamps(check: Check, stamps: FloatArray, max_gap_s: float | None) -> None:
     steps = np.diff(stamps, prepend=stamps[0] - 1.0)
     check(steps != 0.0, lambda i: f"repeats the stamp {stamps[i]:.9g} s of the line before: remove one of them")
     check(

@@ -1,4 +1,4 @@
-"""What a suite is: a YAML file with its version, its licence and its entries, read into configs to be rendered.
+"""What a suite is: a YAML file with its version, its licence and its entries; its configs, and what they would take.
 
 suite = read_definition("rollingrooms")
 planned, skipped = suite.planned(tier="small", only=(), data=None, test_seed=None)
@@ -8,39 +8,55 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
+from pydantic import Field, StringConstraints, ValidationError, model_validator
 
+from rsgen.config.cameras import ColorConfig
 from rsgen.config.config import Config, load_config
+from rsgen.config.sections import Section
 from rsgen.console.configs import config_file, configs_folder, scaled
+from rsgen.console.tables import Table
 from rsgen.errors import UserError, first_problem
 from rsgen.files import read_yaml
 from rsgen.motion.stretch import Ranges, draw_stretch
-from rsgen.produce.parts import load_motion
+from rsgen.sequence.trajectory import read_trajectory
 
 FORMAT = "rsgen-suite/1"
 SUITE = "suite.yaml"
 Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+@dataclass(frozen=True)
+class RenderOptions:
+    """What of a suite is rendered; each field's text is also the help of the option of its name."""
+
+    tier: Annotated[str | None, "only sequences of this tier (default: all)", "TIER"] = None
+    only: Annotated[
+        tuple[str, ...] | None, "only sequences whose name, group or role is this; * and ? allowed", "GLOB"
+    ] = None
+    data: Annotated[Path | None, "folder with recorded trajectories that do not ship, such as ICL-NUIM's", "DIR"] = None
+    hold_back_truth: Annotated[
+        Path | None, "put all of test sequences that gives their motion away into this folder instead", "DIR"
+    ] = None
+    test_seed: Annotated[int | None, "seeds of test sequences are drawn from this number: keep it to yourself", "N"] = (
+        None
+    )
 
 
-class Ladder(_Part):
+class Ladder(Section):
     """One sequence a value: all `fields` (dotted, s) of the config are set to it, and the name tells it in ms."""
 
     fields: tuple[str, ...] = Field(min_length=1)
     values_s: tuple[float, ...] = Field(min_length=1)
 
 
-class Draws(_Part):
+class Draws(Section):
     """So many sequences along random stretches of the motion; ranges as `Ranges` has them, s."""
 
     count: int = Field(ge=1, le=1_000_000)
@@ -51,7 +67,7 @@ class Draws(_Part):
     turn_deg: float = Field(default=20.0, ge=0, le=180)
 
 
-class Entry(_Part):
+class Entry(Section):
     """A sequence, or several by a ladder or by lot. set: fields of the config by dotted names. width: px of all images,
     lenses in proportion. frames: of a stretch of the motion from start_s on; without, all of it. data: fields of the
     config that are files which do not ship, to be looked for in --data. group: of sequences that differ in one thing.
@@ -62,11 +78,11 @@ class Entry(_Part):
     tier: Word = "full"
     role: Literal["train", "test"] = "train"
     group: str = ""
-    set: dict[str, Any] = {}
+    set: dict[str, Any] = Field(default={})
     width: int | None = Field(default=None, ge=16)
     frames: int | None = Field(default=None, ge=2)
     start_s: float = Field(default=0.0, ge=0)
-    data: dict[str, str] = {}
+    data: dict[str, str] = Field(default={})
     ladder: Ladder | None = None
     draw: Draws | None = None
 
@@ -87,7 +103,7 @@ class Entry(_Part):
             yield self.model_copy(update={"name": name, "ladder": None, "set": self.set | fields})
 
 
-class Definition(_Part):
+class Definition(Section):
     """A suite. license: of the images, by its SPDX name; homepage: of the programs that made them."""
 
     format: Literal["rsgen-suite/1"]
@@ -198,6 +214,8 @@ def _of_entry(entry: Entry, data: Path | None, test_seed: int | None) -> list[Pl
 
 def _drawn(entry: Entry, draw: Draws, path: Path, fields: dict[str, Any]) -> Iterator[Planned]:
     """The sequences by lot of an entry, each of which depends on its number alone, not on how many there are."""
+    from rsgen.produce.parts import load_motion
+
     assert entry.frames is not None
     whole = _config(path, fields | {"name": entry.name})
     motion, rate = load_motion(whole), whole.cameras[whole.view].rate_hz
@@ -222,3 +240,76 @@ def _lasts(config: Config, frames: int) -> float:
 
 def _config(path: Path, fields: dict[str, Any]) -> Config:
     return load_config(path, {name: json.dumps(value) for name, value in fields.items()})
+
+
+# Seconds on two slow cores, everything written, of a sample, a depth, an image and a sequence: lr_kt2, 120 frames at
+# 320x240 and 640x480 in 36 and 71 s.
+_S_PER_SAMPLE, _S_PER_DEPTH, _S_PER_IMAGE, _S_PER_SEQUENCE = 1.2e-7, 3e-7, 0.05, 3.0
+# A pixel's bytes, of colour and of depth with its exact image; of the poses of a line; of the scene's surface.
+_BYTES_PER_COLOR, _BYTES_PER_DEPTH, _BYTES_PER_LINE, _BYTES_OF_SCENE = 1.7, 4.1, 56.0, 7.1e6
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What sequences take: frames of all cameras, s of rendering on two cores, bytes; bakes of light come on top."""
+
+    frames: int
+    seconds: float
+    bytes: float
+    bakes: int
+
+    def text(self) -> str:
+        """In one line."""
+        hours, gigabytes = self.seconds / 3600, self.bytes / 1e9
+        took = f"{hours:.1f} h" if hours >= 1 else f"{self.seconds / 60:.0f} min"
+        light = f"{self.bakes} bakes of light, minutes each" if self.bakes != 1 else "a bake of light, minutes"
+        return f"{self.frames} images, about {gigabytes:.2g} GB and {took} of rendering, and {light}"
+
+
+def estimate(configs: Iterable[Config]) -> Estimate:
+    """By numbers of images, pixels and samples alone: other scenes and machines differ by a factor of two or three."""
+    frames, seconds, size, baked = 0, 0.0, 0.0, set()
+    for config in configs:
+        lasts, size, seconds = _duration(config), size + _BYTES_OF_SCENE, seconds + _S_PER_SEQUENCE
+        baked.add(f"{config.scene} {config.light}")
+        for camera in config.cameras.values():
+            count, pixels = int((lasts - camera.offset_s) * camera.rate_hz + 1e-6) + 1, camera.width * camera.height
+            frames, size = frames + count, size + count * camera.height * _BYTES_PER_LINE
+            if isinstance(camera, ColorConfig):
+                images = 1 + len(config.truth.images)
+                seconds += count * images * (_S_PER_IMAGE + pixels * camera.spp * _S_PER_SAMPLE)
+                size += count * images * pixels * _BYTES_PER_COLOR
+            else:
+                seconds += count * (_S_PER_IMAGE + pixels * _S_PER_DEPTH)
+                size += count * pixels * _BYTES_PER_DEPTH
+    return Estimate(frames, seconds, size, len(baked))
+
+
+def _duration(config: Config) -> float:
+    """Of a sequence, s, without making its motion."""
+    if config.stretch is not None:
+        return config.stretch.duration_s
+    if config.motion is not None:
+        return config.motion.duration_s
+    assert config.trajectory.file is not None  # or there were a motion
+    stamps = read_trajectory(config.trajectory.file, config.trajectory.format, config.trajectory.icl_start).stamps
+    return float(stamps[-1] - stamps[0])
+
+
+def describe_suite(suite: Definition) -> str:
+    """Its sequences by tier, and what those that need no --data would take. Raises UserError."""
+    blocks = [f"{suite.name} {suite.version} ({suite.license}): {suite.about}"]
+    for tier in suite.tiers:
+        entries = suite.chosen(tier, ())
+        rows = tuple((entry.name, entry.role, entry.group, entry.config, _length(entry)) for entry in entries)
+        blocks.append(Table((f"tier {tier}", "role", "group", "config", "length"), rows, words=(0, 1, 2, 3, 4)).text())
+        planned, skipped = suite.planned(tier, (), None, None)
+        without = f", without {len(skipped)} that need --data" if skipped else ""
+        blocks.append(f"{len(planned)} sequences: {estimate(p.config for p in planned).text()}{without}")
+    return "\n".join(blocks)
+
+
+def _length(entry: Entry) -> str:
+    several = f"{entry.draw.count} of " if entry.draw else ""
+    needs = f", needs {', '.join(entry.data.values())}" if entry.data else ""
+    return several + ("the whole motion" if entry.frames is None else f"{entry.frames} frames") + needs

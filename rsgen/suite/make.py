@@ -14,8 +14,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rsgen.config.cameras import ColorConfig
 from rsgen.config.config import Config
 from rsgen.console.progress import Progress, no_progress
@@ -30,15 +28,12 @@ from rsgen.files import (
     remove_stale_temporaries,
     write_error,
 )
-from rsgen.produce.batches import by_scene
-from rsgen.produce.generate import ORIGIN, render_sequence
+from rsgen.produce.generate import ORIGIN, by_scene, for_other_processes, loaded_last, render_sequence
 from rsgen.produce.parts import LoadedScene, load_scene_and_light
 from rsgen.produce.records import fingerprint
 from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
-from rsgen.suite.definition import FORMAT, SUITE, Definition, Planned
-from rsgen.suite.listing import estimate
+from rsgen.suite.definition import FORMAT, SUITE, Definition, Planned, RenderOptions, estimate
 from rsgen.suite.manifest import MANIFEST, FileRecord, read_manifest, record_files, rule_of, sha256_of, write_manifest
-from rsgen.suite.options import RenderOptions
 
 log = logging.getLogger("rsgen")
 
@@ -60,7 +55,9 @@ class SuiteJob:
     @property
     def key(self) -> str:
         """Of the scene and its light."""
-        return json.dumps([part.model_dump(mode="json") for part in _lit(self.planned.config)])
+        config = self.planned.config
+        lit = config.scene, config.light, config.target
+        return json.dumps([part.model_dump(mode="json") for part in lit if part])
 
 
 @dataclass(frozen=True)
@@ -137,14 +134,6 @@ def make_sequence(job: SuiteJob, progress: Progress) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def _lit(config: Config) -> list[Any]:
-    return [config.scene, config.light, *([config.target] if config.target else [])]
-
-
-# Scene and light that this process rendered last, by what they were made from.
-_loaded: dict[str, LoadedScene] = {}
-
-
 def _loaded_scene(job: SuiteJob, progress: Progress) -> LoadedScene | None:
     """None where things move: their light is made for each sequence."""
     config = job.planned.config
@@ -152,26 +141,19 @@ def _loaded_scene(job: SuiteJob, progress: Progress) -> LoadedScene | None:
         return None
     view = config.cameras[config.view]
     key = job.key + str(view.spp if isinstance(view, ColorConfig) else 1)
-    if key not in _loaded:
-        _loaded.clear()
-        _loaded[key] = load_scene_and_light(config, progress)
-    return _loaded[key]
+    return loaded_last(key, lambda: load_scene_and_light(config, progress))
 
 
 def _stated_cameras(config: Config) -> dict[str, Any]:
     """A camera.yaml of what sequence.yaml states: of a driver's stamps colour's offset is not known."""
-    color, depth, faults = config.declared_color, config.declared_depth, config.injected
-    T_color_depth = np.array(config.declared_T_color_depth, float)
-    is_exact = faults.color is None and faults.depth is None
-    cameras = Cameras(color.camera, color.shutter, depth.camera, depth.shutter, depth.depth_scale, T_color_depth)
+    cameras = Cameras.of(config.declared_color, config.declared_depth, config.declared_T_color_depth)
+    is_exact = config.injected.color is None and config.injected.depth is None
     clock = ColorClock() if is_exact else ColorClock("auto", is_exact=False)
     return camera_yaml(cameras, clock, config.depth.registered)
 
 
 def _job(one: Planned, out: Path, truth: Path | None) -> SuiteJob:
-    config = one.config
-    scene = config.scene.model_copy(update={"file": config.scene.file.resolve()})  # for other processes
-    one = Planned(one.name, one.entry, config.model_copy(update={"scene": scene}))
+    one = Planned(one.name, one.entry, for_other_processes(one.config))
     held = None if truth is None or one.entry.role != "test" else (truth / one.name).resolve()
     return SuiteJob(one, (out / one.name).resolve(), (out / _DONE / f"{one.name}.json").resolve(), held)
 

@@ -25,25 +25,12 @@ from rsgen.produce.generate import ORIGIN
 
 FORMAT = "rsgen-manifest/1"
 MANIFEST = "manifest.json"
-# Every rule by its name, in words; `_RULES` below does what they say.
-RULES = {
-    "exact": "the same bytes",
-    "description": "the same but for versions, hashes of inputs and the fingerprint over both",
-    "numbers": "the same text and shapes, numbers within 1e-8: a fit's last bits, or the last decimal",
-    "depth": "metres within 0.1 mm in 99.9 % of pixels: at edges another surface may be seen",
-    "labels": "the same thing in 99 % of pixels",
-    "boxes": "made from labels, which are compared themselves",
-    "sensor": "16-bit depth, the same within two units in 99 % of pixels",
-    "image": "8 bits, PSNR 40 dB or more",
-    "truth": "of 99 % of pixels within 0.001 of the channel's largest value",
-    "surface": "the same number of bytes: vertices may differ in their last bits",
-}
 _LEAST_DB = 40.0
 
 
 @dataclass(frozen=True)
 class FileRecord:
-    """size: bytes. match: a name of RULES. held_back: left out where truth is held back."""
+    """size: bytes. match: a name of _RULES. held_back: left out where truth is held back."""
 
     size: int
     sha256: str
@@ -82,16 +69,12 @@ def record_files(folder: Path) -> dict[str, FileRecord]:
     return {name: FileRecord(path.stat().st_size, sha256_of(path), rule_of(path)) for name, path in names.items()}
 
 
-def encode_manifest(about: Mapping[str, str], files: Mapping[str, FileRecord]) -> bytes:
-    """manifest.json: a line a file, in order."""
-    head = json.dumps({"format": FORMAT, **about, "rules": RULES}, indent=1)[:-2]
-    rows = (f"  {json.dumps(path)}: {json.dumps(_record(files[path]))}" for path in sorted(files))
-    return (head + ',\n "files": {\n' + ",\n".join(rows) + "\n }\n}\n").encode()
-
-
 def write_manifest(folder: Path, about: Mapping[str, str], files: Mapping[str, FileRecord]) -> None:
-    """Write it whole or not at all. Raises UserError."""
-    atomic_write(folder / MANIFEST, encode_manifest(about, files))
+    """Write manifest.json, a line a file, in order; whole or not at all. Raises UserError."""
+    rules = {name: words for name, (words, _) in _RULES.items()}
+    head = json.dumps({"format": FORMAT, **about, "rules": rules}, indent=1)[:-2]
+    rows = (f"  {json.dumps(path)}: {json.dumps(_record(files[path]))}" for path in sorted(files))
+    atomic_write(folder / MANIFEST, (head + ',\n "files": {\n' + ",\n".join(rows) + "\n }\n}\n").encode())
 
 
 def read_manifest(folder: Path) -> dict[str, FileRecord]:
@@ -155,13 +138,9 @@ def _match_fault(mine: Path, theirs: Path, record: FileRecord) -> str | None:
         return None if record.held_back else f"{missing[0]} is missing"
     try:
         same = mine.read_bytes() == theirs.read_bytes()
-        return None if same else _RULES[record.match](mine, theirs)
+        return None if same else _RULES[record.match][1](mine, theirs)
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         return f"cannot be compared ({str(error).splitlines()[0][:80]})"
-
-
-def _exact(_: Path, __: Path) -> str:
-    return "has other bytes"
 
 
 def _description(a: Path, b: Path) -> str | None:
@@ -188,48 +167,31 @@ def _parsed(path: Path) -> list[NDArray[Any]]:
     return [np.array([line.replace(",", " ").split() for line in lines], float)]
 
 
-def _png(path: Path) -> NDArray[Any]:
-    if (image := decoded(path.read_bytes())) is None:
-        raise ValueError("no picture")
-    return image.astype(float)
-
-
 def _image(a: Path, b: Path) -> str | None:
-    mine, theirs = _png(a), _png(b)
+    mine, theirs = _pixels(a), _pixels(b)
     if mine.shape != theirs.shape:
         return "has another size"
     db = 10 * np.log10(255.0**2 / max(float(np.mean((mine - theirs) ** 2)), 1e-12))
     return None if db >= _LEAST_DB else f"PSNR {db:.1f} dB, less than {_LEAST_DB:g}"
 
 
-def _sensor(a: Path, b: Path) -> str | None:
-    return _share(_png(a), _png(b), 2.0, 0.99, "two units")
-
-
-def _labels(a: Path, b: Path) -> str | None:
-    return _share(_png(a), _png(b), 0.0, 0.99, "the same thing")
-
-
-def _boxes(_: Path, __: Path) -> None:
-    return None
-
-
-def _depth(a: Path, b: Path) -> str | None:
-    return _share(_exr(a), _exr(b), 1e-4, 0.999, "0.1 mm")
-
-
 def _truth(a: Path, b: Path) -> str | None:
-    mine, theirs = _exr(a), _exr(b)
-    return _share(mine, theirs, 1e-3 * max(1.0, float(np.abs(mine).max())), 0.99, "0.001 of the largest")
+    return _share(a, b, 1e-3 * max(1.0, float(np.abs(_pixels(a)).max())), 0.99, "0.001 of the largest")
 
 
-def _exr(path: Path) -> NDArray[Any]:
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = file.channels()
-        return np.nan_to_num(np.stack([channels[name].pixels.astype(float) for name in sorted(channels)], axis=-1))
+def _pixels(path: Path) -> NDArray[Any]:
+    """Of a PNG as OpenCV has it, or of an EXR, its channels by name."""
+    if path.suffix == ".exr":
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = file.channels()
+            return np.nan_to_num(np.stack([channels[name].pixels.astype(float) for name in sorted(channels)], axis=-1))
+    if (image := decoded(path.read_bytes())) is None:
+        raise ValueError("no picture")
+    return image.astype(float)
 
 
-def _share(mine: NDArray[Any], theirs: NDArray[Any], within: float, least: float, words: str) -> str | None:
+def _share(a: Path, b: Path, within: float, least: float, words: str) -> str | None:
+    mine, theirs = _pixels(a), _pixels(b)
     if mine.shape != theirs.shape:
         return "has another size"
     share = float((np.abs(mine - theirs) <= within).mean())
@@ -241,7 +203,22 @@ def _surface(a: Path, b: Path) -> str | None:
     return None if sizes[0] == sizes[1] else f"has {sizes[0]} bytes, not {sizes[1]}"
 
 
-_RULES: dict[str, Callable[[Path, Path], str | None]] = {
-    "exact": _exact, "description": _description, "numbers": _numbers, "depth": _depth, "sensor": _sensor,
-    "labels": _labels, "boxes": _boxes, "image": _image, "truth": _truth, "surface": _surface,
-}  # fmt: skip
+# Every rule by its name: in words, and what it finds wrong with two files whose bytes differ.
+_RULES: dict[str, tuple[str, Callable[[Path, Path], str | None]]] = {
+    "exact": ("the same bytes", lambda *_: "has other bytes"),
+    "description": ("the same but for versions, hashes of inputs and the fingerprint over both", _description),
+    "numbers": ("the same text and shapes, numbers within 1e-8: a fit's last bits, or the last decimal", _numbers),
+    "depth": (
+        "metres within 0.1 mm in 99.9 % of pixels: at edges another surface may be seen",
+        lambda a, b: _share(a, b, 1e-4, 0.999, "0.1 mm"),
+    ),
+    "labels": ("the same thing in 99 % of pixels", lambda a, b: _share(a, b, 0.0, 0.99, "the same thing")),
+    "boxes": ("made from labels, which are compared themselves", lambda *_: None),
+    "sensor": (
+        "16-bit depth, the same within two units in 99 % of pixels",
+        lambda a, b: _share(a, b, 2.0, 0.99, "two units"),
+    ),
+    "image": ("8 bits, PSNR 40 dB or more", _image),
+    "truth": ("of 99 % of pixels within 0.001 of the channel's largest value", _truth),
+    "surface": ("the same number of bytes: vertices may differ in their last bits", _surface),
+}

@@ -22,7 +22,8 @@ from rsgen.device.arrays import aligned
 from rsgen.errors import UserError
 from rsgen.files import read_text
 from rsgen.formats import scene_reader
-from rsgen.scene.meshes import mesh_arrays
+from rsgen.render.irradiance import registry_id
+from rsgen.scene.meshes import mesh_arrays, mesh_corners, meshes_of
 from rsgen.scene.placement import SceneOptions
 
 PARTS = "parts*.csv"
@@ -51,15 +52,15 @@ class Instances:
 
 def find_instances(scene: Any, path: Path, options: SceneOptions) -> Instances:
     """The things of a scene that was loaded from `path` with these options. Raises UserError: PARTS is damaged."""
-    shapes = [shape for shape in scene.shapes() if shape.is_mesh()]
+    shapes = meshes_of(scene)
     counts = np.array([len(mesh_arrays(shape)[1]) for shape in shapes])
     begin = np.cumsum([0, *counts])
-    numbers = np.array([dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in shapes], np.int64)
+    numbers = np.array([registry_id(shape) for shape in shapes])
     first = np.zeros(int(numbers.max()) + 1, np.int64)
     first[numbers] = begin[:-1]
     named: Any = np.repeat(np.array([_plain(shape.id()) for shape in shapes], object), counts)
     if path.suffix.lower() != ".xml":
-        _name_nodes(named, np.concatenate([_middles(shape) for shape in shapes]), path, options)
+        _name_nodes(named, np.concatenate([mesh_corners(shape).mean(axis=1) for shape in shapes]), path, options)
     else:
         parts = {shape: rows for file in sorted(path.parent.glob(PARTS)) for shape, rows in _read_parts(file).items()}
         for shape, at, count in zip(shapes, begin[:-1], counts, strict=True):
@@ -71,11 +72,6 @@ def find_instances(scene: Any, path: Path, options: SceneOptions) -> Instances:
 
 def _plain(shape: str) -> str:
     return shape.removeprefix("mesh_")
-
-
-def _middles(shape: Any) -> FloatArray:
-    vertices, faces = mesh_arrays(shape)
-    return vertices.astype(float)[faces].mean(axis=1)
 
 
 def _name_nodes(named: Any, middles: FloatArray, path: Path, options: SceneOptions) -> None:

@@ -34,8 +34,7 @@ from numpy.typing import NDArray
 from rsgen.array_types import Float32Array, FloatArray
 from rsgen.config.cameras import ColorConfig
 from rsgen.config.sections import GlobalTime, TruthConfig
-from rsgen.device.lens import Lens, contains
-from rsgen.device.pose_table import PoseFunction, PoseTable
+from rsgen.device.lens import Lens, PoseFunction, PoseTable, contains
 from rsgen.device.projection import MovingCamera, rotated_back
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -178,22 +177,19 @@ class TruthRenderer:
 
     def _cast(self, now: MovingCamera, shutter: Shutter, things: ObjectsInFrame | None) -> _PixelHits:
         """What the pixels' centres see at their lines' mid-exposure. The sensor must be exposed to the frame."""
-        camera = self._camera
-        pixel = dr.arange(mi.UInt32, camera.width * camera.height)
-        uv = mi.Point2f(pixel % camera.width, pixel // camera.width)
-        position = mi.Point2f((uv.x + 0.5) / camera.width, (uv.y + 0.5) / camera.height)
-        ray, _ = self._sensor.sample_ray(0.5 * shutter.exposure_s, mi.Float(0), position, mi.Point2f(0.5))
+        u, v, ray = self._sensor.central_rays()
+        uv = mi.Point2f(u, v)
         hit = self._scene.ray_intersect_preliminary(ray, coherent=True)
         normal = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
         normal = dr.select(hit.is_valid(), dr.select(dr.dot(normal, ray.d) < 0, normal, -normal), 0)
-        begin = now.lens.line_of(*uv) * shutter.line_delay(camera)
-        origin, R_world_cam = now.pose(begin + 0.5 * shutter.exposure_s)
+        begin = now.lens.line_of(*uv) * shutter.line_delay(self._camera)
+        origin, rows = now.pose(begin + 0.5 * shutter.exposure_s)
         w = dr.select(hit.is_valid(), mi.Float(1), 0)
         p = dr.select(hit.is_valid(), mi.Point3f(origin) + hit.t * ray.d, ray.d)
         z = dr.select(hit.is_valid(), hit.t * self._sensor.planar_depth_scale(uv.x, uv.y), 0)
         label = mi.UInt32(0) if self._instances is None else self._instances.seen_by(hit)
         if things is None:
-            return _PixelHits(uv, begin, p, w, normal, rotated_back(R_world_cam, normal), z, label=label)
+            return _PixelHits(uv, begin, p, w, normal, rotated_back(rows, normal), z, label=label)
         meeting = things.meet(ray, dr.select(hit.is_valid(), hit.t, dr.inf))
         met, number = meeting.number > 0, meeting.number
         p = dr.select(met, things.place(meeting), p)
@@ -203,7 +199,7 @@ class TruthRenderer:
         dr.eval(p, normal, number, z, w)
         if self._instances is not None:
             label = dr.select(met, len(self._instances.names) + number, label)
-        n_cam = rotated_back(R_world_cam, n_world)
+        n_cam = rotated_back(rows, n_world)
         return _PixelHits(uv, begin, p, dr.select(met, 1, w), normal, n_cam, z, number, label)
 
     def _flow(

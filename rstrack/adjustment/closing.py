@@ -80,9 +80,7 @@ def _closed(graph: Graph, loops: Sequence[Loop], spread: float, progress: Progre
     return Closed(graph.at, tuple(refused.tolist()), spread)
 
 
-def _settled(
-    graph: Graph, loops: Sequence[Loop], width: float, progress: Progress
-) -> tuple[State, FloatArray]:  # fmt: skip
+def _settled(graph: Graph, loops: Sequence[Loop], width: float, progress: Progress) -> tuple[State, FloatArray]:
     """The state with these loops, and the weights of their sightings; width: of the kernel, inf at first."""
     sightings = [s for loop in loops for s in loop.sightings]
     count, whole = len(graph.sightings), replace(graph, sightings=[*graph.sightings, *sightings])

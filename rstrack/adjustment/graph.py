@@ -164,7 +164,7 @@ class _Stacked:
             begins[:-1] + np.array(counts, int) // 2,
             gradient,
             [(np.concatenate([rows for rows, _ in of_d]), np.concatenate([H for _, H in of_d])) for of_d in parts],
-        )  # fmt: skip
+        )
 
 
 class _System(BlockSystem):

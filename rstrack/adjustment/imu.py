@@ -18,10 +18,9 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.band import MotionBand
+from rstrack.inertial.band import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 from rstrack.inertial.estimate import STRENGTH, ImuEstimate, bias_walk
 from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.residuals import ImuReadings, guessed_gravity, reading_sigmas
 
 # About how far apart the biases' knots are, s.
 _KNOT_S = 1.0
@@ -126,10 +125,10 @@ class ImuTerm:
         """Of the samples within valid (k, 2), s: where the spline is an estimate; None without any, or a gyroscope."""
         samples = ImuReadings.of(recording)
         begin, end = np.maximum(valid[:, 0], spline.t_begin), np.minimum(valid[:, 1], spline.t_end)
-        inside = ((samples.t[:, None] >= begin) & (samples.t[:, None] < end)).any(axis=1)
+        inside = np.asarray(((samples.t[:, None] >= begin) & (samples.t[:, None] < end)).any(axis=1))
         if recording.gyro is None or not inside.any():
             return None
-        samples = ImuReadings(samples.t[inside], samples.values[inside], samples.counts[inside])
+        samples = samples[inside]
         band, noise = MotionBand.of(recording), reading_sigmas(recording)
         sigma = np.hypot(noise, band.scatter(spline.dt))
         per = max(1, round(_KNOT_S / spline.dt))
@@ -186,8 +185,7 @@ class ImuTerm:
         for r, *_ in self._rows(spline, state):
             squares += ((r * np.repeat(self.sigma, 3)) ** 2).reshape(-1, 2, 3).sum(axis=(0, 2))
         number = self.samples.counts.reshape(-1, 2, 3).sum(axis=(0, 2))
-        followed = min(1.0, 1.0 / (self.recording.rate_hz * spline.dt)) * self.noise**2
-        sigma = np.sqrt(squares / np.maximum(1.0, number) + followed)
+        sigma = np.sqrt(variance_about(spline.dt, self.recording, squares, number))
         return replace(self, sigma=np.where(number > 0.0, np.maximum(self.noise, sigma), self.sigma))
 
     def _rows(self, spline: Spline, state: ImuState) -> Iterator[tuple[FloatArray, FloatArray, IntArray, IntArray]]:
@@ -201,7 +199,7 @@ class ImuTerm:
                 end = int(np.searchsorted(segment, segment[begin + _AT_ONCE]))
                 end = end if end > begin else int(np.searchsorted(segment, segment[begin], side="right"))
             part = slice(begin, end)
-            samples = ImuReadings(self.samples.t[part], self.samples.values[part], self.samples.counts[part])
+            samples = self.samples[part]
             at = ImuFactor(motion(spline, samples.t), state.T_imu_depth, state.gravity)
             scale = 1.0 + state.scales
             knot, rest = np.divmod(segment[part] - self.segment, self.per)

@@ -20,10 +20,9 @@ from rsgen.geometry.spline import Spline
 from rstrack.adjustment.chain import BandedHessian, KeyframeModel
 from rstrack.adjustment.graph import Graph, State
 from rstrack.adjustment.imu import ImuResult, ImuState, ImuTerm
-from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
 from rstrack.alignment.normal_equations import Quadratic
-from rstrack.alignment.observation import Observation, observe
+from rstrack.alignment.observation import Observation, matched_brightness, observe
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.inertial.estimate import ALIKE
@@ -189,12 +188,10 @@ class Refiner:
     def _linearised(self, frame: DeviceFrame, ref: Reference, state: SplineState) -> list[Observation]:
         """A frame's images against a keyframe, those that fit."""
         good = []
-        expected = self._brightness.get(ref.index)
-        if expected is None:
-            expected = np.asarray(brightness.matched(frame.colors[0].moments, ref.moments)) if frame.colors else None
-        for o in observe(frame, ref, self.options, brightness.SAME if expected is None else expected):
+        known = self._brightness.get(ref.index)
+        expected = matched_brightness(frame, ref) if known is None else known
+        for o in observe(frame, ref, self.options, expected, self._inflations):
             usual = self._usual(o)
-            o.independent = 1.0 / self._inflations[not o.is_depth]
             o.begin(usual)
             before = o.nuisance(state)
             for _ in range(_LOOKS):

@@ -10,9 +10,8 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
-from rstrack.alignment import brightness
 from rstrack.alignment.linearise import Terms
-from rstrack.alignment.observation import Observation, observe
+from rstrack.alignment.observation import Observation, matched_brightness, observe
 from rstrack.alignment.optimizer import MOST_STEPS, Problem, Solved, optimise
 from rstrack.alignment.spline_state import SplineState
 from rstrack.images.device_frame import DeviceFrame
@@ -59,12 +58,7 @@ def align(
     """
     mid = frame.depth.exposure.mid_time
     state = _placed(motion, frame, ref.T_world_base @ T_ref_cam @ se3.inverse(motion.pose(mid)))
-    expected = brightness.SAME
-    if frame.colors and ref.points:
-        expected = np.asarray(brightness.matched(frame.colors[0].moments, ref.moments))
-    fresh = observe(frame, ref, options, expected)
-    for o in fresh:
-        o.independent = 1.0 / inflations[not o.is_depth]
+    fresh = observe(frame, ref, options, matched_brightness(frame, ref), inflations)
     problem = Problem(fresh, (), (state.first, state.end), (), ref.lens.camera.fx, rigid=True)
     try:
         solved = optimise(terms, state, problem, levels, MOST_STEPS)

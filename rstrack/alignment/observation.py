@@ -13,7 +13,7 @@ import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.geometry.spline import Spline
-from rstrack.alignment.brightness import SAME, credible
+from rstrack.alignment.brightness import SAME, credible, matched
 from rstrack.alignment.linearise import Linearised, Terms
 from rstrack.alignment.normal_equations import Quadratic, block_diagonal
 from rstrack.alignment.residuals import LEVEL
@@ -248,13 +248,26 @@ class Observation:
         return now
 
 
-def observe(frame: DeviceFrame, ref: Reference, options: Options, expected: FloatArray = SAME) -> list[Observation]:
+def observe(
+    frame: DeviceFrame, ref: Reference, options: Options, expected: FloatArray = SAME,
+    inflations: tuple[float, float] = (1.0, 1.0),
+) -> list[Observation]:  # fmt: skip
     """What the terms of a method make of a frame against a reference: its depth image, and its colour images.
 
-    expected (2,): gain and offset that the colour images are expected to have against the reference.
+    expected (2,): gain and offset that the colour images are expected to have against the reference. inflations: of
+    depth and of colour, see `Independence`.
     """
-    depth = [Observation(frame.index, frame.depth, ref)] if options.geometric else []
-    return depth + [Observation(frame.index, c, ref, frame.depth.hider, expected) for c in frame.colors if ref.points]
+    depth, color = (1.0 / inflation for inflation in inflations)
+    seen = [Observation(frame.index, frame.depth, ref, independent=depth)] if options.geometric else []
+    hider, colors = frame.depth.hider, frame.colors if ref.points else ()
+    return seen + [Observation(frame.index, image, ref, hider, expected, color) for image in colors]
+
+
+def matched_brightness(frame: DeviceFrame, ref: Reference) -> FloatArray:
+    """Gain and offset (2,) of a frame's colour images against a reference, by what both are like as a whole."""
+    if not (frame.colors and ref.points):
+        return SAME
+    return np.asarray(matched(frame.colors[0].moments, ref.moments))
 
 
 # -- the score test --------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What a cell of a benchmark came to: one record, JSON on disk; many of them in one file.
+"""What a cell of a benchmark came to, on which machine and by which version: records, JSON on disk, one or many a file.
 
 records = read_records(Path("benchmarks/results/gate.json"))
 print(records["track/demo/rs-pg"].figures["ate_mm"])
@@ -8,14 +8,25 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import platform
+import resource
+import subprocess
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text
-from rstrack.bench.definitions import OTHERS
+from rstrack.bench.cells import OTHERS
 from rstrack.data.estimate import plain
 from rstrack.options import METHODS
 
@@ -153,6 +164,12 @@ def figure(record: CellRecord | None, name: str) -> float | None:
     return record.figures.get(name) if record is not None and record.is_good else None
 
 
+def frame_times(ms: FloatArray) -> Figures:
+    """What frames took (n,), ms: median, mean and tails."""
+    tails = {f"p{part}_ms": float(np.percentile(ms, part)) for part in (95, 99)}
+    return {"median_ms": float(np.median(ms)), "mean_ms": float(ms.mean()), **tails}
+
+
 def methods_in_order(records: Iterable[CellRecord]) -> list[str]:
     """Names of methods: ours first, variants after what they are variants of, then other people's."""
 
@@ -210,3 +227,70 @@ def _short(record: CellRecord) -> dict[str, Any]:
     runs = [{name: short(value) for name, value in run.items()} for run in record.runs]
     data: dict[str, Any] = plain(asdict(record) | {"runs": runs})
     return data
+
+
+def machine() -> dict[str, Any]:
+    """What figures are taken on, and how busy it is (load: average of the last minute)."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "cpu": models[0] if models else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "system": platform.system(),
+        "python": platform.python_version(),
+    }
+
+
+def stamped(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Version, commit, date and machine, now."""
+    return dict(record) | {
+        "version": package_version(), "commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+        "machine": machine(),
+    }  # fmt: skip
+
+
+def package_version() -> str:
+    """Of this project."""
+    return version("rolling-shutter-rgbd")
+
+
+def versions_behind(version: str) -> int:
+    """Minor versions by which another one of this project is older; many where the major one is another."""
+    then, now = (tuple(int(part) for part in text.split(".")[:2]) for text in (version, package_version()))
+    return now[1] - then[1] if then[0] == now[0] else 999
+
+
+@cache
+def commit() -> str | None:
+    """Of the checkout that this code is in, with a + where files have changed since; None outside of one."""
+    here = Path(__file__).parent
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
+            cwd=here, capture_output=True, text=True, check=False, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return described.stdout.strip() or None
+
+
+def reset_peak() -> None:
+    """Begin anew, where the system can (Linux); elsewhere the peak stays that of the process's life."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return
+
+
+def peak_mb() -> float:
+    """Most main memory at a time since then, MB."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(float(line.split()[1]) * 1024e-6 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak * (1e-6 if sys.platform == "darwin" else 1024e-6)

@@ -1,4 +1,4 @@
-"""Runs the cells of a benchmark that are not there yet, one record each, and gathers all of them.
+"""Runs the cells of a benchmark that are not there yet, one record each; and whole experiments, with what they came to.
 
 records = run_cells(load_benchmark([Path("benchmarks/gate.yaml")]), Path("out/bench/gate"), Sources())
 """
@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -16,17 +17,24 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from rsgen.console.progress import Progress, no_progress
-from rsgen.console.scheduler import InProcess, Workers
+from rsgen.console.progress import Progress, ProgressDisplay, no_progress
+from rsgen.console.scheduler import Workers, open_workers
 from rsgen.device.backend import select
 from rsgen.errors import UserError
 from rstrack.bench.cells import Benchmark, Cell
-from rstrack.bench.machine import package_version, peak_mb, reset_peak, stamped, versions_behind
-from rstrack.bench.record import CellRecord, read_record, write_record
-from rstrack.bench.sequences import Absent, Sources
-from rstrack.bench.task import MEASURES, Task, measure_named
+from rstrack.bench.record import (
+    CellRecord,
+    package_version,
+    peak_mb,
+    read_record,
+    reset_peak,
+    stamped,
+    versions_behind,
+    write_record,
+)
+from rstrack.bench.task import MEASURES, Absent, Sources, Task, measure_named
 from rstrack.data.estimate import TRAJECTORY
 
 log = logging.getLogger("rstrack")
@@ -35,7 +43,7 @@ RECORD = "record.json"
 OLDEST = 2
 """Minor versions that what takes hours may be behind."""
 # Parts of both packages that show things, or read and write for other programs: figures do not depend on them.
-_SHOWING = ("bench", "charts", "cli", "formats", "pack", "pictures", "report", "share", "view")
+_SHOWING = ("bench", "charts", "cli", "formats", "pack", "pictures", "report", "view")
 # What describes a sequence, rsgen's or TUM's; the images themselves are not read for the key.
 _DESCRIPTIONS = (
     "sequence.yaml", "rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt", "camera.yaml", "calibration.yaml"
@@ -114,9 +122,9 @@ def run_cells(
         show(f"{name} {note}")
 
     try:
-        if workers is not None and not isinstance(workers, InProcess):
+        if workers is not None and type(workers) is not Workers:  # elsewhere
             _render(todo, progress)
-        for k, record in (workers or InProcess()).apply(run_cell, todo, report):
+        for k, record in (workers or Workers()).apply(run_cell, todo, report):
             records[record.cell] = record
             running.pop(record.cell, None)
             if record.error is None and read_record(todo[k].out / RECORD) is None:
@@ -185,16 +193,12 @@ def code_digest(measure: str) -> str:
     for package in ("rsgen", "rstrack"):
         spec = find_spec(package)
         root = Path((spec and spec.origin) or "").parent
-        files += [path for path in sorted(root.rglob("*.py")) if path.relative_to(root).parts[0] not in _SHOWING]
+        parts = {path: path.relative_to(root).parts[0].removesuffix(".py") for path in sorted(root.rglob("*.py"))}
+        files += [path for path, part in parts.items() if part not in _SHOWING]
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()
-
-
-def sequence_digest(root: Path) -> str:
-    """Of what describes a sequence: its lists, cameras and truth, not its images."""
-    return ",".join(f"{name} {_file_digest(root / name)}" for name in _DESCRIPTIONS if (root / name).is_file())
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -241,7 +245,10 @@ def _made_of(job: Job, root: Path | None) -> str:
         except UserError:
             return ""
     folder = root or job.sources.found(entry, name)
-    return "" if folder is None else sequence_digest(folder)
+    if folder is None:
+        return ""
+    described = [name for name in _DESCRIPTIONS if (folder / name).is_file()]
+    return ",".join(f"{name} {_file_digest(folder / name)}" for name in described)
 
 
 def _file_digest(path: Path) -> str | None:
@@ -254,3 +261,62 @@ def _file_digest(path: Path) -> str | None:
 
 def _ordered(jobs: list[Job], records: Mapping[str, CellRecord]) -> dict[str, CellRecord]:
     return {job.cell.name: records[job.cell.name] for job in jobs if job.cell.name in records}
+
+
+@dataclass(frozen=True)
+class Written:
+    """text: for the terminal. files: which were written, in words. is_good: nothing was lost or failed."""
+
+    text: str
+    files: str
+    is_good: bool
+
+
+class Experiment(Protocol):
+    """A list of cells, and what is made of their records."""
+
+    def benchmark(self, sources: Sources, progress: Progress) -> Benchmark:
+        """The cells. Raises UserError."""
+
+    def write(self, outcome: Outcome, out: Path) -> Written:
+        """Write tables and records into `out`. Raises UserError."""
+
+    def draw(self, outcome: Outcome, out: Path, progress: Progress, warn: Callable[[str], None]) -> None:
+        """Draw the pictures of finished cells into `out`; one line to `warn` where one fails. Raises UserError."""
+
+
+def run_experiment(experiment: Experiment, out: Path, sources: Sources, quiet: bool) -> int:
+    """Run the cells that `out` does not hold, write, draw and print; returns the exit status. Raises UserError."""
+    warnings: list[str] = []
+    with ProgressDisplay(quiet) as progress:
+        benchmark = experiment.benchmark(sources, progress)
+        if not quiet:
+            _announce(benchmark, sources)
+        with open_workers(sources.scheduler) as workers:
+            outcome = run_cells(benchmark, out, sources, workers, progress)
+        written, interrupted = experiment.write(outcome, out), outcome.interrupted
+        try:
+            if not interrupted:
+                experiment.draw(outcome, out, progress, warnings.append)
+        except KeyboardInterrupt:
+            interrupted = True
+    for warning in warnings:
+        print(f"rstrack: {warning}", file=sys.stderr)
+    print(written.text, flush=True)
+    if interrupted:
+        print(f"rstrack: interrupted; {out} holds what is finished, and the same command goes on", file=sys.stderr)
+        return 130
+    print(f"\n{out}: {written.files} written")
+    return 0 if written.is_good else 1
+
+
+def _announce(benchmark: Benchmark, sources: Sources) -> None:
+    """Say how much is to be rendered before anything is tracked."""
+    entries = {c.case_entry.sequence: c.sequence for c in benchmark.cells if c.sequence.config is not None}
+    missing = [name for name, entry in entries.items() if sources.found(entry, name) is None]
+    if missing:
+        print(
+            f"rstrack: {len(missing)} of {len(entries)} sequences are to be rendered first, minutes each, and more "
+            f"for each scene whose light is not baked yet; kept in {sources.home}, where later runs find them",
+            file=sys.stderr,
+        )

@@ -14,8 +14,7 @@ from typing import Any
 
 from rsgen.console.tables import NOTHING, Entry, Table, best_marked, csv_text, significant
 from rsgen.files import atomic_write
-from rstrack.bench import paper
-from rstrack.bench.figures import heading
+from rstrack.bench.figures import heading, paper_average
 from rstrack.bench.record import (
     CellRecord,
     Figures,
@@ -95,7 +94,7 @@ def cell_triple(record: CellRecord | None) -> str:
 
 def paper_triple(sequences: Sequence[str], method: str) -> str:
     """The paper's averages, empty where it has none."""
-    theirs = paper.average(sequences, method)
+    theirs = paper_average(sequences, method)
     return triple(theirs) if theirs else ""
 
 

@@ -53,27 +53,15 @@ def motion_of(dataset: Dataset, parts: Sequence[range], track: Spline) -> MeanMo
     return MeanMotion(*means)
 
 
-@dataclass(frozen=True)
-class Pace:
-    """Speeds (n,) in m/s and rad/s of the depth camera, at times (n,) in s since the recording's first frame."""
-
-    times_s: FloatArray
-    speeds: FloatArray
-    rotations: FloatArray
-
-    def as_dict(self) -> dict[str, list[float]]:
-        """For JSON, to a ten-thousandth."""
-        named = {"time_s": self.times_s, "m_s": self.speeds, "rad_s": self.rotations}
-        return {name: np.round(values, 4).tolist() for name, values in named.items()}
-
-
-def pace_of(dataset: Dataset, followed: Sequence[range], track: Spline) -> Pace:
-    """At the stamps of the frames that were followed, or so many of them."""
+def pace_of(dataset: Dataset, followed: Sequence[range], track: Spline) -> dict[str, list[float]]:
+    """For JSON, speeds in m/s and rad/s of the depth camera, at times in s since the recording's first frame: those of
+    the frames that were followed, or so many of them; to a ten-thousandth."""
     frames = np.concatenate([np.arange(run.start, run.stop) for run in followed])
     frames = frames[:: -(-len(frames) // _MOST)]
     velocity = track.velocity(dataset.stamps[frames])
     speeds, rotations = (np.linalg.norm(v, axis=1) for v in (velocity[:, :3], velocity[:, 3:]))
-    return Pace(since_begin(dataset, frames), speeds, rotations)
+    named = {"time_s": since_begin(dataset, frames), "m_s": speeds, "rad_s": rotations}
+    return {name: np.round(values, 4).tolist() for name, values in named.items()}
 
 
 def since_begin(dataset: Dataset, frames: Sequence[int] | np.ndarray) -> FloatArray:

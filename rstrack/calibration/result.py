@@ -14,7 +14,6 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rstrack.calibration.figures import (
     MeanMotion,
-    Pace,
     ResidualScales,
     displacement_px,
     lens_map,
@@ -62,7 +61,7 @@ class CameraCalibration:
     motion: MeanMotion
     seconds: float
     residuals: tuple[ResidualScales, ResidualScales]
-    pace: Pace
+    pace: dict[str, list[float]]
     device_notes: tuple[str, ...] = ()
     keeps_file_lens: bool = False
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -166,7 +165,7 @@ class CameraCalibration:
                 "depth_m": {"before": before.depth_m, "after": after.depth_m},
                 "intensity": {"before": before.intensity, "after": after.intensity},
             },
-            "pace": self.pace.as_dict(),
+            "pace": self.pace,
             "motion": {"m_s": self.motion.speed, "rad_s": self.motion.rotation, "rad_s2": self.motion.change},
             "sigma_depth_m": solution.sigma_depth_m, "sigma_intensity": solution.sigma_intensity,
             "finished": solution.finished, "converged": solution.is_settled, "seconds": self.seconds,

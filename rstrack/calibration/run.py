@@ -10,31 +10,23 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import astuple, replace
+from functools import partial
 
 import numpy as np
 
 from rsgen.array_types import BoolArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.device.arrays import engine
+from rsgen.device.arrays import Engine, engine
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
 from rstrack.calibration.devices import Device, device_notes
 from rstrack.calibration.figures import motion_of, pace_of, residuals_at, residuals_now, some_of
-from rstrack.calibration.pairs.terms import PairTerms, pair_terms
+from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.trust import trust_in
 from rstrack.calibration.pairs.window import RecordingWindow
-from rstrack.calibration.parameters import (
-    COLOR_LENS,
-    DEPTH_LENS,
-    DRIFT,
-    GROUPS,
-    LENSES,
-    Known,
-    Parameters,
-    free_of,
-)
+from rstrack.calibration.parameters import COLOR_LENS, DEPTH_LENS, DRIFT, GROUPS, LENSES, Known, Parameters, free_of
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.solve import solve
 from rstrack.calibration.stages import StageResult, in_stages, progress_watch
@@ -77,7 +69,7 @@ def calibrate(
     groups = _usual(dataset) if groups is None else groups
     _check(dataset, groups, frames)
     chosen = range(len(dataset))[frames]
-    engine(options.backend)  # before anything else imports Dr.Jit, which then would choose a libLLVM itself
+    e = engine(options.backend)  # before anything else imports Dr.Jit, which then would choose a libLLVM itself
     if "intrinsics" in groups:
         dataset = _bent(dataset)
     before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
@@ -85,11 +77,11 @@ def calibrate(
     track = first_track(dataset, chosen, options, progress)
     parts = _windows(dataset, chosen, track)
     free = _free(dataset, groups, parts)
-    terms = pair_terms(engine(options.backend), dataset, free)
+    terms = PairTerms(e, dataset, free)
     windows = _loaded(dataset, terms, parts, track.spline, start, options, progress)
     if not dataset.scan_named and "readout" in groups:
-        dataset = _oriented(dataset, windows, start, options, progress)
-        terms = pair_terms(engine(options.backend), dataset, free)
+        dataset = _oriented(e, dataset, windows, start, progress)
+        terms = PairTerms(e, dataset, free)
         windows = [each.read_by(terms) for each in windows]
     residuals = residuals_at(some_of(windows), terms, start)
     known = before.with_lenses() if "intrinsics" in groups else before
@@ -102,11 +94,8 @@ def calibrate(
         parts, windows = [parts[k] for k in kept], [windows[k] for k in kept]
 
         def staged(known: Known, p: Parameters) -> StageResult:
-            def terms_of(free: BoolArray) -> PairTerms:
-                return pair_terms(engine(options.backend), dataset, free)
-
             is_exact = not dataset.rig.sigma.depth_inverse_offset
-            return in_stages(windows, terms_of, known, p, free, is_exact, progress)
+            return in_stages(windows, partial(PairTerms, e, dataset), known, p, free, is_exact, progress)
 
         stage = staged(known, coarse.values)
         contradicted = before.contradicted(stage.solution.values, stage.solution.sigmas)
@@ -144,7 +133,7 @@ def _loaded(
 
 
 def _oriented(
-    dataset: Dataset, windows: Sequence[RecordingWindow], start: Parameters, options: Options, progress: Progress
+    e: Engine, dataset: Dataset, windows: Sequence[RecordingWindow], start: Parameters, progress: Progress
 ) -> Dataset:
     """The dataset with images that are read by rows or by columns, whichever fits better after some steps.
 
@@ -156,7 +145,7 @@ def _oriented(
     for count, scan in enumerate(_AXES):
         progress("scan direction", count / len(_AXES), scan)
         turned = _scanned(dataset, scan)
-        terms = pair_terms(engine(options.backend), turned, free)
+        terms = PairTerms(e, turned, free)
         tried = solve([each.read_by(terms) for each in few], terms, start, free, _COARSE, steps=_TRIED_STEPS)
         found.append((tried.cost, turned))
     progress("scan direction", 1.0, "")

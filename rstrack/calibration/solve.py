@@ -40,7 +40,7 @@ class Solution:
 
     cost: negative log-likelihood a pixel. sigma_depth_m, sigma_intensity: of the residuals, medians. last_step (31,):
     the last one that was taken. blind (31,): σ of what no scatter shows. finished: nobody interrupted it. known
-    (31, 31): `Known.information`. pixels: that were compared. depth_overcounts: mean over the windows, see `Sums`.
+    (31, 31): `Known.information`. pixels: that were compared. depth_overcounts: mean over windows, see `WindowSums`.
     """
 
     values: Parameters

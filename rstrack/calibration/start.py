@@ -26,9 +26,7 @@ from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
 from rstrack.data.dataset import Dataset
-from rstrack.images.line_poses import Exposure
-from rstrack.images.pyramid import color_image, intensity
-from rstrack.images.sampling import level_size
+from rstrack.images.pyramid import in_range, intensity, pyramid
 from rstrack.options import Method, Options
 from rstrack.tracking.first_look.rough_track import rough_track
 
@@ -116,18 +114,17 @@ def load_window(
 
     Raises UserError: an image that cannot be read.
     """
-    e, camera, surfaces, bounds = terms.e, dataset.rig.color_camera, [], []
+    surfaces, bounds = [], []
     colors: list[list[Float32Image]] = []
     for k in frames:
         surfaces.append(_surface(dataset, k, options.max_depth))
         colors.append([])
         if dataset.groups[k]:
             color = dataset.images.color(dataset.groups[k][0])
-            shown = color_image(e, Exposure(terms.color, 0.0, np.eye(4)), color).levels
-            sizes = [[level_size(size, n) for size in (camera.height, camera.width)] for n in range(len(shown))]
-            colors[-1] = [e.download(level, tuple(size)) for level, size in zip(shown, sizes, strict=True)]
-            bounds.append(intensity_bound(intensity(color), camera.fx, surfaces[-1].median_depth))
-    images = window_images(e, surfaces, colors, max(bounds), terms.stride)
+            grey = intensity(color)
+            colors[-1] = in_range(pyramid(grey), color)
+            bounds.append(intensity_bound(grey, dataset.rig.color_camera.fx, surfaces[-1].median_depth))
+    images = window_images(terms.e, surfaces, colors, max(bounds), terms.stride)
     views = [_view(terms, dataset, k) for k in frames]
     begin, end = span([taken for view in views for taken in (view.depth, view.color)], p)
     knot_s = options.knots_s()

@@ -1,4 +1,4 @@
-"""What a figure shows, apart from how it is drawn: lines, ticks and bars, camera paths in space, and a calibration.
+"""What a figure shows, apart from how it is drawn: lines, ticks and bars, and camera paths in space.
 
 A chart has a title, and a note with what the reader has to know.
 """
@@ -138,63 +138,6 @@ class PathChart:
         size = np.maximum(high - low, max(0.2 * float((high - low).max()), 1e-3))
         middle = (low + high) / 2
         return [(float(m - 0.53 * s), float(m + 0.53 * s)) for m, s in zip(middle, size, strict=True)]
-
-
-@dataclass(frozen=True)
-class MovedValue:
-    """How far a value moved from its start, and twice its σ, NaN where undetermined; both in the chart's unit."""
-
-    label: str
-    change: float
-    two_sigma: float
-    hover: str
-
-    @property
-    def is_found(self) -> bool:
-        """Whether the recording determines it."""
-        return bool(np.isfinite(self.two_sigma))
-
-
-@dataclass(frozen=True)
-class ChangeChart:
-    """For each unit an axis of its own, with a row for each of its values."""
-
-    title: str
-    by_unit: tuple[tuple[str, tuple[MovedValue, ...]], ...]
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class StripChart:
-    """Rows of cells over time, the darker the larger their parts (r, s), and curves below along the same time.
-
-    spans (s, 2): from when to when a column is, s. curves: each has an axis of its own, of this unit.
-    """
-
-    title: str
-    names: tuple[str, ...]
-    spans: FloatArray
-    parts: FloatArray
-    curves: tuple[tuple[str, Curve], ...]
-    x_label: str
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class LensChart:
-    """Points of an image at (n, 2), how far the lens has moved them (n, 2), drawn `magnified` times as far, and their
-    2 σ (n,); px."""
-
-    title: str
-    at: FloatArray
-    moved: FloatArray
-    two_sigma: FloatArray
-    magnified: float
-    note: str = ""
-
-
-AnyChart = Chart | PathChart | ChangeChart | StripChart | LensChart
-"""Everything that the page shows; files are drawn of `Chart` and `PathChart`."""
 
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:

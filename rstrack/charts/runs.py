@@ -26,9 +26,9 @@ from rstrack.charts.chart import (
     method_colors,
 )
 from rstrack.charts.to_file import write_charts
-from rstrack.metrics.clock import TruthOffset
 from rstrack.metrics.evaluate import drift, evaluate
-from rstrack.metrics.tracked import Tracked, load_run, true_path
+from rstrack.metrics.run_evaluate import Tracked, load_run, true_path
+from rstrack.metrics.truth_fit import TruthOffset
 
 BLUE, ORANGE = COLORS[:2]
 _TIME = "time since the first frame, s"

@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rstrack.charts.chart import (
-    COLORS,
-    TRUE_COLOR,
-    AnyChart,
-    CameraPath,
-    ChangeChart,
-    Chart,
-    Curve,
-    LensChart,
-    MovedValue,
-    PathChart,
-    StripChart,
-    broken,
-)
+from rstrack.charts.chart import COLORS, TRUE_COLOR, CameraPath, Chart, Curve, PathChart, broken
 
 PlotlyFigure = dict[str, Any]
 """{"data": [trace, ...], "layout": {...}}, with "height" (px) where it goes by the number of rows.
@@ -42,15 +30,24 @@ _STRIP_COLORS = [[0.0, "rgba(42,127,201,0.05)"], [1.0, "rgba(42,127,201,0.75)"]]
 _LONG = 18
 
 
+@dataclass(frozen=True)
+class PageChart:
+    """A figure that only a page shows; note: what the reader has to know."""
+
+    title: str
+    figure: PlotlyFigure
+    note: str = ""
+
+
+AnyChart = Chart | PathChart | PageChart
+"""Everything that the page shows; files are drawn of the first two."""
+
+
 def figure_of(chart: AnyChart, points: int) -> PlotlyFigure:
     """points: at most so many of each line and path."""
-    if isinstance(chart, Chart):
-        return _chart(chart, points)
-    if isinstance(chart, PathChart):
-        return _paths(chart, points)
-    if isinstance(chart, ChangeChart):
-        return _changes(chart)
-    return _strips(chart) if isinstance(chart, StripChart) else _lens(chart)
+    if isinstance(chart, PageChart):
+        return dict(chart.figure)
+    return _chart(chart, points) if isinstance(chart, Chart) else _paths(chart, points)
 
 
 def _chart(chart: Chart, points: int) -> PlotlyFigure:
@@ -168,20 +165,24 @@ def _short(values: FloatArray, digits: int | None = None) -> list[float | None]:
 # of a calibration
 
 
-def _lens(chart: LensChart) -> PlotlyFigure:
-    """A line from each point to where it has moved, and a dot at its beginning with the colour of its 2 σ."""
-    ends = chart.at + chart.magnified * chart.moved
-    between = np.full(len(chart.at), np.nan)
-    x, y = (_short(np.stack([chart.at[:, k], ends[:, k], between], axis=1).ravel(), 5) for k in (0, 1))
+def lens_figure(at: FloatArray, moved: FloatArray, two_sigma: FloatArray, magnified: float) -> PlotlyFigure:
+    """Points of an image at (n, 2), how far the lens has moved them (n, 2), and their 2 σ (n,); px.
+
+    A line from each point to where it has moved, `magnified` times as far, and a dot at its beginning with the colour
+    of its 2 σ.
+    """
+    ends = at + magnified * moved
+    between = np.full(len(at), np.nan)
+    x, y = (_short(np.stack([at[:, k], ends[:, k], between], axis=1).ravel(), 5) for k in (0, 1))
     style = {"line": {"color": TRUE_COLOR, "width": 1.6}, "hoverinfo": "skip", "showlegend": False}
-    length = np.linalg.norm(chart.moved, axis=1)
+    length = np.linalg.norm(moved, axis=1)
     marker = {
-        "size": 7, "color": _short(chart.two_sigma, 5), "colorscale": "Viridis", "cmin": 0.0,
+        "size": 7, "color": _short(two_sigma, 5), "colorscale": "Viridis", "cmin": 0.0,
         "colorbar": {"title": {"text": "2 σ, px"}, "thickness": 12},
     }  # fmt: skip
     dots = _scatter(
-        "", *(_short(chart.at[:, k], 5) for k in (0, 1)), mode="markers", showlegend=False, marker=marker,
-        text=[f"{a:.2f} ± {b:.2f} px" for a, b in zip(length, chart.two_sigma, strict=True)],
+        "", *(_short(at[:, k], 5) for k in (0, 1)), mode="markers", showlegend=False, marker=marker,
+        text=[f"{a:.2f} ± {b:.2f} px" for a, b in zip(length, two_sigma, strict=True)],
         hovertemplate="(%{x:.0f}, %{y:.0f}): moved by %{text}<extra></extra>",
     )  # fmt: skip
     axis = {"zeroline": False, "fixedrange": True}
@@ -192,13 +193,28 @@ def _lens(chart: LensChart) -> PlotlyFigure:
     return {"data": [_scatter("", x, y, mode="lines", **style), dots], "layout": layout, "height": _LENS}
 
 
-def _changes(chart: ChangeChart) -> PlotlyFigure:
+@dataclass(frozen=True)
+class MovedValue:
+    """How far a value moved from its start, and twice its σ, NaN where undetermined; both in the chart's unit."""
+
+    label: str
+    change: float
+    two_sigma: float
+    hover: str
+
+    @property
+    def is_found(self) -> bool:
+        """Whether the recording determines it."""
+        return bool(np.isfinite(self.two_sigma))
+
+
+def change_figure(by_unit: Mapping[str, Sequence[MovedValue]]) -> PlotlyFigure:
     """A dot with whiskers for each value, around the line of no change; an axis for each unit."""
-    height = _TOP + sum(_ROW * len(rows) + _AXIS for _, rows in chart.by_unit)
+    height = _TOP + sum(_ROW * len(rows) + _AXIS for rows in by_unit.values())
     inner = height - _TOP - _AXIS
     data: list[dict[str, Any]] = []
     layout, top = _layout(_AXIS), 0
-    for n, (unit, rows) in enumerate(chart.by_unit):
+    for n, (unit, rows) in enumerate(by_unit.items()):
         found = [row for row in rows if row.is_found]
         of_axis = {"xaxis": _axis("x", n), "yaxis": _axis("y", n)}
         undetermined = [row for row in rows if not row.is_found]
@@ -231,14 +247,19 @@ def _dots(rows: Sequence[MovedValue], is_found: bool) -> dict[str, Any]:
     return dots | ({"error_x": whiskers} if is_found else {})
 
 
-def _strips(chart: StripChart) -> PlotlyFigure:
-    """Cells above, curves below, all over one time."""
-    height = _TOP + len(chart.names) * _ROW + len(chart.curves) * (_CURVE + _GAP) + _BOTTOM
+def strip_figure(
+    names: Sequence[str], spans: FloatArray, parts: FloatArray, curves: Sequence[tuple[str, Curve]], x_label: str
+) -> PlotlyFigure:
+    """Rows of cells over time, the darker the larger their parts (r, s), and curves below along the same time.
+
+    spans (s, 2): from when to when a column is, s. curves: each has an axis of its own, of this unit.
+    """
+    height = _TOP + len(names) * _ROW + len(curves) * (_CURVE + _GAP) + _BOTTOM
     inner = height - _TOP - _BOTTOM
-    layout, bottom = _layout(_BOTTOM), 1.0 - _ROW * len(chart.names) / inner
-    data: list[dict[str, Any]] = [_cells(chart)] if chart.names else []
+    layout, bottom = _layout(_BOTTOM), 1.0 - _ROW * len(names) / inner
+    data: list[dict[str, Any]] = [_cells(names, spans, parts)] if names else []
     layout["yaxis"] = _names(bottom, 1.0) | {"autorange": "reversed", "showgrid": False}
-    for n, (unit, line) in enumerate(chart.curves, 1):
+    for n, (unit, line) in enumerate(curves, 1):
         top = bottom - _GAP / inner
         bottom = top - _CURVE / inner
         style = {"line": {"color": line.color, "width": 1.4}, "yaxis": _axis("y", n)}
@@ -249,28 +270,28 @@ def _strips(chart: StripChart) -> PlotlyFigure:
             "domain": [max(0.0, bottom), top], "anchor": "x", "rangemode": "tozero", "zeroline": False, "nticks": 4,
             "title": {"text": f"{line.name},<br>{unit}", "standoff": 6}, "automargin": True, "fixedrange": True,
         }  # fmt: skip
-    times = np.concatenate([chart.spans.ravel(), *(line.x[np.isfinite(line.x)] for _, line in chart.curves)])
+    times = np.concatenate([spans.ravel(), *(line.x[np.isfinite(line.x)] for _, line in curves)])
     layout["xaxis"] = {
-        "title": {"text": chart.x_label}, "zeroline": False, "anchor": _axis("y", len(chart.curves)),
+        "title": {"text": x_label}, "zeroline": False, "anchor": _axis("y", len(curves)),
         "range": [float(times.min(initial=0.0)), float(times.max(initial=1.0))],
     }  # fmt: skip
     return {"data": data, "layout": layout | {"showlegend": False}, "height": height}
 
 
-def _cells(chart: StripChart) -> dict[str, Any]:
+def _cells(names: Sequence[str], spans: FloatArray, parts: FloatArray) -> dict[str, Any]:
     """A heat map whose columns are the windows and the gaps between them, which hold nothing."""
-    edges: list[float] = [float(chart.spans[0, 0])]
+    edges: list[float] = [float(spans[0, 0])]
     columns: list[int | None] = []
-    for k, (begin, end) in enumerate(chart.spans.tolist()):
+    for k, (begin, end) in enumerate(spans.tolist()):
         if begin > edges[-1]:
             edges.append(begin)
             columns.append(None)
         edges.append(end)
         columns.append(k)
-    parts = [_short(np.array([np.nan if k is None else row[k] for k in columns]), 5) for row in 100.0 * chart.parts]
+    shown = [_short(np.array([np.nan if k is None else row[k] for k in columns]), 5) for row in 100.0 * parts]
     return {
-        "type": "heatmap", "x": edges, "y": [_two_lines(name) for name in chart.names], "z": parts, "zmin": 0.0,
-        "zmax": float(max(1.0, 100.0 * chart.parts.max(initial=0.0))), "colorscale": _STRIP_COLORS, "showscale": False,
+        "type": "heatmap", "x": edges, "y": [_two_lines(name) for name in names], "z": shown, "zmin": 0.0,
+        "zmax": float(max(1.0, 100.0 * parts.max(initial=0.0))), "colorscale": _STRIP_COLORS, "showscale": False,
         "texttemplate": "%{z:.0f}", "xgap": 1, "ygap": 3, "hoverongaps": False, "yaxis": "y", "xaxis": "x",
         "hovertemplate": "%{y}: %{z:.1f} % at %{x:.1f} s<extra></extra>",
     }  # fmt: skip

@@ -1,7 +1,8 @@
-"""The command `rstrack bench`: methods on sequences beside the paper's figures, the readout sweep, the stress test."""
+"""The commands that measure: `rstrack bench` (methods, the readout sweep, the stress test) and `rstrack score`."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,11 +16,14 @@ from rstrack.cli.options import TruthOffset
 from rstrack.options import METHODS, Options
 
 if TYPE_CHECKING:
-    from rstrack.bench.experiments.run import Experiment
+    from rstrack.bench.runner import Experiment
+
 
 BENCH_STATUS = (
     "exit status: 0 done, 1 a track was lost or failed, 2 wrong input, 130 interrupted (the same command resumes)"
 )
+
+SCORE_STATUS = "exit status: 0 done, 1 something is lost, missing or failed, 2 wrong input, 130 interrupted"
 
 
 def _added(text: str) -> tuple[str, Path]:
@@ -105,8 +109,8 @@ def bench(
     weights. The last two render missing sequences. Finished cells are stored: the same command resumes.
     """
     from rsgen.files import read_yaml
-    from rstrack.bench.experiments.run import run_experiment
-    from rstrack.bench.sequences import Sources
+    from rstrack.bench.runner import run_experiment
+    from rstrack.bench.task import Sources
 
     text = read_yaml(config)
     given: dict[str, object] = {
@@ -157,8 +161,7 @@ def _readout(
     config: Path, narrowed: Narrowed, tracker: Options, frames: slice | None, motions: tuple[str, ...],
     methods: tuple[str, ...],
 ) -> Experiment:  # fmt: skip
-    from rstrack.bench.experiments.readout import load_sweep, narrow
-    from rstrack.bench.experiments.readout_results import ReadoutExperiment
+    from rstrack.bench.experiments.readout import ReadoutExperiment, load_sweep, narrow
 
     chosen = narrow(
         load_sweep(config), motions=motions, seeds=narrowed.seeds, methods=methods, readouts_s=narrowed.readout,
@@ -178,3 +181,66 @@ def _stress(
     tracker = Options(**asdict(tracker) | ({"method": methods[0]} if methods else {}))
     options = StressOptions(frames=None if frames is None else frames.stop, width=narrowed.width, tracker=tracker)
     return StressExperiment(config, replace(options, exposures_s=narrowed.exposure) if narrowed.exposure else options)
+
+
+def score(
+    suite: Annotated[
+        Path, "folder that holds SEQUENCE/ folders; its suite.yaml, if any, states their tiers and groups"
+    ],
+    results: Annotated[
+        tuple[Path, ...],
+        "folders with METHOD/SEQUENCE.txt (TUM), such a METHOD, run folders of 'rstrack track', or the folder of "
+        "'rstrack bench'",
+    ] = (),
+    *,
+    out: Annotated[Path, "folder for scores.json and the page index.html, made if need be", "DIR"],
+    only: Annotated[
+        tuple[str, ...] | None, "only sequences whose name, tier, role or group is this; * and ? allowed", "NAME"
+    ] = None,
+    run: Annotated[
+        tuple[str, ...] | None,
+        "also track the suite with these methods or peers, for example rs-pg gs-pg kiss-icp; 'peers' is all peers. "
+        "Runs are kept in DIR/runs, and the same command resumes",
+        "METHOD",
+    ] = None,
+    scheduler: Scheduler = None,
+    quiet: Quiet = False,
+) -> int:
+    """Score trajectories of any tracker on a suite of sequences: writes scores.json and a leaderboard. Beside
+    METHOD/SEQUENCE.txt may lie SEQUENCE.cov (covariances as smfeval reads them) and SEQUENCE.times (ms a frame), and
+    METHOD/method.yaml with name, url, note, camera (depth or color: whose poses these are), alignment (se3 or sim3)
+    and ms_per_frame.
+    """
+    from rsgen.console.progress import ProgressDisplay
+    from rsgen.files import atomic_write, make_folder
+    from rstrack.report.leaderboard import leaderboard, summary
+    from rstrack.report.page import write_page
+    from rstrack.score.scores import score_suite
+    from rstrack.score.suite import find_methods, read_suite
+
+    chosen = read_suite(suite, only or ())
+    names = [entry.name for entry in chosen.entries]
+    if not (results or run):
+        raise UserError("no results to score: name folders with METHOD/SEQUENCE.txt, or methods to --run")
+    given = find_methods(results, names)  # complain before hours of tracking
+    with ProgressDisplay(quiet) as progress:
+        if run:
+            from rstrack.score.suite import run_methods
+
+            outcome = run_methods(chosen, run, out / "runs", scheduler, progress)
+            for record in outcome.records.values():
+                if record.error is not None:
+                    print(f"not tracked: {record.method}, {record.case}: {record.error}", file=sys.stderr)
+            if outcome.interrupted:
+                print(f"rstrack: interrupted; the same command goes on with {out / 'runs'}", file=sys.stderr)
+                return 130
+            given = find_methods((*results, out / "runs"), names)
+        scores = score_suite(chosen, given, progress)
+        make_folder(out)
+        atomic_write(out / "scores.json", scores.json_text().encode())
+        page = write_page(leaderboard(scores), out / "index.html")
+    print(summary(scores))
+    for line in scores.gaps:
+        print(f"not scored: {line}", file=sys.stderr)
+    print(f"\n{page}: written, open it in a browser; all figures are in {out / 'scores.json'}")
+    return 1 if scores.gaps else 0

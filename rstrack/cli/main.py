@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from rsgen.console.command_line import Commands, Parser, Quiet, run_program
-from rstrack.cli.benchmark import BENCH_STATUS, bench
+from rstrack.cli.benchmark import BENCH_STATUS, SCORE_STATUS, bench, score
 from rstrack.cli.options import CameraFile, ImuFile, SequenceFolder
 from rstrack.cli.results import evaluate, export, map_, report
-from rstrack.cli.score import SCORE_STATUS, score
 from rstrack.cli.tracking import CALIBRATE_STATUS, TRACK_STATUS, calibrate, refine, track
 
 _DESCRIPTION = """\

@@ -90,7 +90,7 @@ def export(
         return 0
     from rsgen.console.progress import ProgressDisplay
     from rstrack.mapping.keyframes import write_keyframes
-    from rstrack.metrics.tracked import load_run
+    from rstrack.metrics.run_evaluate import load_run
 
     tracked = load_run(run, sequence, camera)
     if tracked.dataset is None:

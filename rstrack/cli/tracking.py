@@ -14,11 +14,12 @@ from rsgen.console.command_line import Alone, Frames, Json, Quiet
 from rsgen.device.backend import Backend
 from rsgen.errors import UserError
 from rstrack.cli.options import CameraFile, DeviceName, ImuFile, NoiseDepth, NoiseIntensity, Seed, SequenceFolder
+from rstrack.cli.results import RunSequence
 from rstrack.options import Options
 
 if TYPE_CHECKING:
     from rstrack.data.dataset import Dataset
-    from rstrack.view.viewer import Viewer
+    from rstrack.view import Viewer
 
 TRACK_STATUS = (
     "exit status: 0 done, 1 frames were lost or cannot be read, 2 wrong input, 130 interrupted (what there is has been "
@@ -58,9 +59,8 @@ def track(
     """
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.camera_file import camera_file_of
     from rstrack.calibration.devices import device_named
-    from rstrack.calibration.record import CALIBRATION, write_record
+    from rstrack.calibration.record import CALIBRATION, camera_file_of, write_record
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.data.dataset import open_dataset
     from rstrack.data.rig import UNDISTORTED_K1
@@ -121,7 +121,7 @@ def track(
 def _viewed(view: Path | None, dataset: Dataset) -> AbstractContextManager[Viewer | None]:
     if view is None:
         return nullcontext()
-    from rstrack.view.viewer import open_view
+    from rstrack.view import open_view
 
     return open_view(None if view == Path() else view, dataset.rig, dataset.name)
 
@@ -163,23 +163,17 @@ def calibrate(
     """Find a recording's cameras from its images alone: lenses, readouts, clocks, extrinsics, with standard errors."""
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.camera_file import camera_file_of
     from rstrack.calibration.devices import device_named
-    from rstrack.calibration.record import content_of, record_of
+    from rstrack.calibration.record import camera_file_of, content_of, record_of
     from rstrack.calibration.run import calibrate as calibrate_cameras
     from rstrack.calibration.several import check_alike, together
     from rstrack.data.dataset import open_dataset
-    from rstrack.data.image_files import NoisyImages
-    from rstrack.report.build import write_page
     from rstrack.report.calibration import calibration_page
+    from rstrack.report.page import write_page
 
     known = None if device is None else device_named(device)
     groups = None if free is None else tuple(name.strip() for name in free.split(",") if name.strip())
-    datasets = [open_dataset(path, camera) for path in sequence]
-    if noise_depth or noise_intensity:
-        datasets = [
-            replace(each, images=NoisyImages(each.images, noise_depth, noise_intensity, seed)) for each in datasets
-        ]
+    datasets = [open_dataset(path, camera).noisy(noise_depth, noise_intensity, seed) for path in sequence]
     dataset, first = datasets[0], sequence[0]
     if len(datasets) > 1 and (report is not None or json or groups == ("imu",)):
         raise UserError("--report, --json and --free imu: are of one recording: give one")
@@ -226,7 +220,7 @@ def _imu(
 ) -> int:  # fmt: skip
     from rsgen.console.progress import ProgressDisplay
     from rsgen.files import atomic_write
-    from rstrack.calibration.imu.run import calibrate_imu, track_of, track_of_run
+    from rstrack.calibration.imu import calibrate_imu, track_of, track_of_run
 
     if dataset.imu_files is not None:
         dataset.imu_files.description()  # complain before minutes of tracking
@@ -244,7 +238,7 @@ def _imu(
 def refine(
     run: Annotated[Path, "folder that 'rstrack track' wrote, of a method with a spline"],
     *,
-    sequence: Annotated[Path | None, "the run's sequence (default: where it was)", "DIR"] = None,
+    sequence: RunSequence = None,
     camera: CameraFile = None,
     imu: ImuFile = None,
     out: Annotated[Path, "folder for the refined run, made if need be", "DIR"],

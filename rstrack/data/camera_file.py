@@ -13,8 +13,8 @@ holds. `rstrack calibrate` finds both and writes such a file. clocks: {NAME: {of
 recording in a folder of that name alone. color.falloff: see `Rig`; auto: `track` finds it. stamps: see there, too.
 sigma: {focal: 0.01, center_px: 3, ...}: how far this may be wrong, see `CalibrationSigma`; the rest is by default.
 depth.registered: warped into the colour camera, see `rstrack.data.registration`. depth.offset_s: seconds added to
-depth's stamps. calibration.yaml: see `rstrack.data.opencv_camera_file`; Kalibr's camchain.yaml: see
-`rstrack.data.kalibr_camera_file`. A run.json holds the cameras of its run in the same form (`camera_content`).
+depth's stamps. calibration.yaml and Kalibr's camchain.yaml: see `rstrack.data.foreign_camera_files`. A run.json holds
+the cameras of its run in the same form (`camera_content`).
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
 from rstrack.data.estimate import read_info
-from rstrack.data.kalibr_camera_file import Camchain, is_camchain, read_camchain
-from rstrack.data.opencv_camera_file import is_opencv, opencv_content
-from rstrack.data.registration import DepthSensor, registered_shutter
+from rstrack.data.foreign_camera_files import Camchain, is_camchain, is_opencv, opencv_content, read_camchain
+from rstrack.data.registration import registered_shutter
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError, Rig, rigid_transform, sigma_of_file
 from rstrack.data.timing import StampsMode
 
 EXAMPLE = "color: {width: 640, height: 480, intrinsics: [fx, fy, cx, cy], readout_s: 0.028}"
+CAMERA_FILES = ("camera.yaml", "calibration.yaml", "camchain-imucam.yaml", "camchain.yaml")
 _KEYS = "color, depth, T_color_depth, stamps, clocks and sigma, each camera with width, height, intrinsics, readout_s"
 
 Size = tuple[int, int]
@@ -196,6 +196,13 @@ def read_rig(path: Path, color_size: Size, depth_size: Size) -> RigFile:
     return _of_camchain(read_camchain(path, content)) if is_camchain(content) else _of_content(path, content)
 
 
+def find_camera_file(root: Path, camera_file: Path | None) -> Path | None:
+    """The given one, else that in the folder, None without any."""
+    if camera_file is not None:
+        return camera_file
+    return next((root / name for name in CAMERA_FILES if (root / name).exists()), None)
+
+
 def run_cameras(info: Mapping[str, Any]) -> dict[str, Any] | None:
     """The cameras of a run whose run.json holds `info`, as a camera.yaml has them; None where it has none."""
     dataset = info.get("dataset")
@@ -275,8 +282,7 @@ def _depth_shutter(
     if depth.sensor is None:
         return depth.shutter, 0.0, ()
     T = rigid_transform("depth.sensor.T_color_sensor", depth.sensor.T_color_sensor or np.eye(4))
-    sensor = DepthSensor(depth.sensor.camera("depth.sensor"), depth.shutter, T)
-    return *registered_shutter(camera, sensor), ()
+    return *registered_shutter(camera, depth.sensor.camera("depth.sensor"), depth.shutter, T), ()
 
 
 def _first(error: ValidationError) -> str:

@@ -25,7 +25,7 @@ from rsgen.sequence.images import Sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import RigFile, camera_content, run_cameras
 from rstrack.data.estimate import INFO
-from rstrack.data.image_files import ImageReader, prefetched
+from rstrack.data.image_files import ImageReader, NoisyImages, prefetched
 from rstrack.data.imu.recording import ImuFiles, ImuRecording, ReadImu, find_imu
 from rstrack.data.layouts import LAYOUTS, layout_of
 from rstrack.data.registration import RegisteredImage, Registrar
@@ -74,6 +74,13 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    def chosen(self, frames: slice) -> range:
+        """The numbers of these frames. Raises UserError: there are none."""
+        chosen = range(len(self))[frames]
+        if not len(chosen):
+            raise UserError(f"{self.root}: has no frame {frames.start}: its frames are 0 to {len(self) - 1}")
+        return chosen
 
     def interval_s(self, frames: range) -> float | None:
         """The median time from one of these frames to the next, s; None of a single one."""
@@ -163,6 +170,12 @@ class Dataset:
             self, rig=replace(self.rig, sigma=sigma), color_stamps=color_stamps, groups=groups, timing=timing,
             color_drift=drift,
         )  # fmt: skip
+
+    def noisy(self, sigma_depth: float, sigma_intensity: float, seed: int) -> Dataset:
+        """The same recording with noise in its images, see `rstrack.data.image_files.with_noise`."""
+        if not (sigma_depth or sigma_intensity):
+            return self
+        return replace(self, images=NoisyImages(self.images, sigma_depth, sigma_intensity, seed))
 
     def with_color_falloff(self, falloff: float, note: str = "") -> Dataset:
         """The same recording with colours that are known to darken so towards the corners, see `Rig`.
@@ -254,6 +267,35 @@ def open_tracked(path: Path, run: Path, info: dict[str, Any], camera_file: Path 
     """
     recorded = None if run_cameras(info) is None else run / INFO
     return open_dataset(path, camera_file or recorded).as_seen_by(info)
+
+
+def recorded_dataset(
+    root: Path, file: RigFile, depth_stamps: FloatArray, color_stamps: FloatArray, images: ImageReader,
+    truth_poses: Trajectory | None, notes: tuple[str, ...], depth_numbers: FloatArray | None = None,
+) -> Dataset:  # fmt: skip
+    """A recording's folder with the stamps as its camera file wants them.
+
+    file: the camera file's content. depth_stamps (n,), color_stamps (m,): as listed, s, increasing. truth_poses:
+    T_world_depth. notes: what had to be assumed, each in one line. depth_numbers: of frames that are numbered, the
+    seconds (n,) by their numbers alone. Raises UserError.
+    """
+    name = root.resolve().name
+    file = file.of(name)
+    try:
+        depth = stream_timing("depth", depth_stamps, file.stamps, file.depth_offset_s)
+        color = stream_timing("colour", color_stamps, file.stamps, 0.0)
+    except UserError as error:
+        raise UserError(f"{root}: {error}") from None
+    if depth_numbers is not None:
+        depth = replace(depth, listed=depth_numbers)
+    timing = Timing(depth, color, file.color_offset_s, file.notes)
+    dataset = Dataset(
+        name, root, file.rig, depth.used, color.used, (), images, truth_poses=truth_poses, notes=notes, timing=timing,
+        scan_named=file.scan_named, depth_scale=file.depth_scale, depth_offset_s=file.depth_offset_s,
+        depth_error=file.depth_error,
+    )  # fmt: skip
+    found = dataset.with_color_offset(file.color_offset_s or 0.0, drift=file.color_drift)
+    return replace(found, timing=timing)
 
 
 def group_colors(depth_stamps: npt.ArrayLike, color_stamps: npt.ArrayLike) -> tuple[tuple[int, ...], ...]:

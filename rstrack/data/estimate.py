@@ -17,6 +17,7 @@ import numpy.typing as npt
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_text, write_error
+from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_npz
 from rsgen.sequence.format import pose_rows
@@ -30,8 +31,6 @@ ONLINE_TRAJECTORY, ONLINE_SPLINE = "trajectory_online.txt", "spline_online.npz"
 INFO = "run.json"
 SEGMENTS = "segments"
 """A TUM file of each segment of the track of which it is not known where it lies, by its number."""
-
-_ORTHONORMAL_WITHIN = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +65,7 @@ class Estimate:
             np.diff(stamps, prepend=-np.inf) <= 0.0,
             lambda i: f"is stamped {stamps[i]:.9g} s, not after the {stamps[i - 1]:.9g} s before it: sort the poses",
         )
-        R = T[:, :3, :3]
-        skew = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2), initial=0.0) > _ORTHONORMAL_WITHIN
-        skew |= (np.linalg.det(R) < 0.0) | (T[:, 3] != (0.0, 0.0, 0.0, 1.0)).any(axis=1)
-        _refuse(skew, lambda i: "is not a rigid motion: pass the poses through se3.orthonormalise")
+        _refuse(~se3.is_rigid(T), lambda i: "is not a rigid motion: pass the poses through se3.orthonormalise")
         _intervals(self.info)
 
     @property

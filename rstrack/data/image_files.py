@@ -85,6 +85,16 @@ def repeated(paths: Sequence[Path]) -> npt.NDArray[np.bool_]:
     return same
 
 
+def repeats_note(name: str, again: npt.NDArray[np.bool_]) -> tuple[str, ...]:
+    """For the screen, nothing where there are none. again (n,): which images of a stream are the one before again."""
+    if not again.any():
+        return ()
+    return (
+        f"{np.count_nonzero(again)} of {len(again)} {name} images are the one before again, byte for byte: they were "
+        "not taken anew, and are left out",
+    )
+
+
 def _same_bytes(a: Path, b: Path) -> bool:
     try:
         return a.stat().st_size == b.stat().st_size and a.read_bytes() == b.read_bytes()
@@ -168,17 +178,10 @@ def with_noise(frame: Frame, k: int, sigma_depth: float, sigma_intensity: float,
       level of variance) and clipped to uint8.
     Raises UserError for deviations that are negative or not finite, and for a negative seed.
     """
-    for name, sigma in (("depth", sigma_depth), ("intensity", sigma_intensity)):
-        if not (math.isfinite(sigma) and sigma >= 0):
-            raise UserError(f"noise: sigma_{name} = {sigma!r} must be a finite number, 0 or more")
-    if seed < 0:
-        raise UserError(f"noise: seed = {seed} must be 0 or more")
-    depth = _noisy_depth(frame.depth, sigma_depth, np.random.default_rng([seed, k, 0])) if sigma_depth else frame.depth
-    colors = frame.colors
-    if sigma_intensity:
-        generators = (np.random.default_rng([seed, k, stream]) for stream in range(1, 1 + len(colors)))
-        colors = tuple(_noisy_color(*pair, sigma_intensity) for pair in zip(colors, generators, strict=True))
-    return Frame(depth, colors)
+    _check_noise(sigma_depth, sigma_intensity, seed)
+    depth = Image(frame.depth.stamp, _noisy_depth(frame.depth.pixels, sigma_depth, seed, k))
+    colors = (_noisy_color(image.pixels, sigma_intensity, seed, k, n) for n, image in enumerate(frame.colors, 1))
+    return Frame(depth, tuple(Image(image.stamp, pixels) for image, pixels in zip(frame.colors, colors, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -190,28 +193,40 @@ class NoisyImages:
     sigma_intensity: float
     seed: int
 
+    def __post_init__(self) -> None:
+        _check_noise(self.sigma_depth, self.sigma_intensity, self.seed)
+
     def color(self, k: int) -> ByteArray:
         """RGB (h, w, 3)."""
-        image = Image(0.0, self.images.color(k))
-        frame = Frame(Image(0.0, np.zeros((1, 1), np.float32)), (image,))
-        return np.asarray(with_noise(frame, k, 0.0, self.sigma_intensity, self.seed).colors[0].pixels, np.uint8)
+        return _noisy_color(self.images.color(k), self.sigma_intensity, self.seed, k, 1)
 
     def depth(self, k: int) -> Float32Array:
         """Planar z (h, w) in metres, 0 = missing."""
-        frame = Frame(Image(0.0, self.images.depth(k)), ())
-        return np.asarray(with_noise(frame, k, self.sigma_depth, 0.0, self.seed).depth.pixels, np.float32)
+        return _noisy_depth(self.images.depth(k), self.sigma_depth, self.seed, k)
 
 
-def _noisy_depth(image: Image, sigma: float, rng: np.random.Generator) -> Image:
-    z = image.pixels
-    noise = rng.standard_normal(z.shape, np.float32)
-    return Image(image.stamp, np.maximum(z + np.float32(sigma) * z * z * noise, np.float32(0.0)))
+def _check_noise(sigma_depth: float, sigma_intensity: float, seed: int) -> None:
+    for name, sigma in (("depth", sigma_depth), ("intensity", sigma_intensity)):
+        if not (math.isfinite(sigma) and sigma >= 0):
+            raise UserError(f"noise: sigma_{name} = {sigma!r} must be a finite number, 0 or more")
+    if seed < 0:
+        raise UserError(f"noise: seed = {seed} must be 0 or more")
 
 
-def _noisy_color(image: Image, rng: np.random.Generator, sigma: float) -> Image:
-    levels = np.rint(np.float32(255.0 * sigma) * rng.standard_normal(image.pixels.shape[:2], np.float32))
+def _noisy_depth(z: Float32Array, sigma: float, seed: int, k: int) -> Float32Array:
+    if not sigma:
+        return z
+    noise = np.random.default_rng([seed, k, 0]).standard_normal(z.shape, np.float32)
+    return np.maximum(z + np.float32(sigma) * z * z * noise, np.float32(0.0))
+
+
+def _noisy_color(pixels: ByteArray, sigma: float, seed: int, k: int, stream: int) -> ByteArray:
+    if not sigma:
+        return pixels
+    noise = np.random.default_rng([seed, k, stream]).standard_normal(pixels.shape[:2], np.float32)
+    levels = np.rint(np.float32(255.0 * sigma) * noise)
     field = np.clip(levels, -255, 255).astype(np.int16)  # beyond these everything clips anyway
-    return Image(image.stamp, np.asarray(cv2.add(image.pixels, cv2.merge([field] * 3), dtype=cv2.CV_8U), np.uint8))
+    return np.asarray(cv2.add(pixels, cv2.merge([field] * 3), dtype=cv2.CV_8U), np.uint8)
 
 
 Key = TypeVar("Key")

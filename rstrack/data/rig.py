@@ -118,8 +118,7 @@ NO_DEPTH_ERROR = DepthError()
 
 @lru_cache(maxsize=4)
 def _squared_radius(camera: Camera) -> Float32Array:
-    x, y = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
-    rays = camera.unproject(np.stack([x, y], axis=-1))
+    rays = camera.unproject(camera.pixel_grid())
     return np.nan_to_num((rays[..., :2] ** 2).sum(axis=-1)).astype(np.float32)
 
 

@@ -26,16 +26,16 @@ from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import encode_yaml, write_error
 from rsgen.sequence.format import pose_rows
-from rsgen.sequence.trajectory import MAX_POSITION_M, MIN_POSES
+from rsgen.sequence.trajectory import MAX_POSITION_M, MAX_STAMP_S, MIN_POSES
 from rstrack.data.imu.description import imu_yaml
 from rstrack.data.imu.recording import IMU_YAML
 from rstrack.data.layouts.tum_folder import ESTIMATED
-from rstrack.data.own_intrinsics import FILES
+from rstrack.data.registration import FILES
 from rstrack.formats.recording import ImageIntrinsics, ImuSample, RecordedImage, RecordedPose, Recording, StreamCamera
 
 RECORD = "import.json"
 _NAMES = {"color": "colour", "depth": "depth"}
-_MOST_NS = 10**20  # the year 5138: beyond that, stamps are refused when they are read, too
+_MOST_NS = int(1e9 * MAX_STAMP_S)  # beyond that, stamps are refused when they are read, too
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"

@@ -41,7 +41,10 @@ def color_png(where: str, message: Any, camera: Camera) -> bytes:
     """A PNG of a sensor_msgs/Image of the camera's size. Raises UserError."""
     encoding = str(message.encoding).lower()
     if encoding not in _CHANNELS:
-        raise UserError(f"{where}: colour with encoding {message.encoding!r:.40} is not supported: {_supported()}")
+        raise UserError(
+            f"{where}: colour with encoding {message.encoding!r:.40} is not supported: rgb8, bgr8, rgba8, bgra8, "
+            "mono8, yuyv or uyvy; debayer others with image_proc"
+        )
     rows = _rows(where, message, camera, _CHANNELS[encoding], 1)
     pixels: ByteArray = rows.reshape(camera.height, camera.width, _CHANNELS[encoding])
     code = _TO_RGB.get(encoding)
@@ -144,7 +147,3 @@ def _rows(where: str, message: Any, camera: Camera, channels: int, size: int) ->
     if padded is not data:  # the last line without its padding
         padded[: len(data)] = data
     return np.ascontiguousarray(padded[: step * camera.height].reshape(camera.height, step)[:, :wanted])
-
-
-def _supported() -> str:
-    return "rgb8, bgr8, rgba8, bgra8, mono8, yuyv or uyvy; debayer others with image_proc"

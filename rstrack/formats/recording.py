@@ -23,6 +23,7 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan
+from rsgen.inputs import MOST_PIXELS
 from rsgen.sequence.format import StreamName
 from rstrack.data.imu.description import ImuNoise
 
@@ -143,8 +144,6 @@ class ReadOptions:
         return [name for name in (self.color, self.depth, self.color_info, self.depth_info) if name is not None]
 
 
-# Larger than any camera's: a damaged file, which must not decide how much memory is taken.
-_MOST_PIXELS = 1 << 26
 _LENSES: dict[str, Model] = {
     **dict.fromkeys(("", "none", "pinhole"), "pinhole"),
     **dict.fromkeys(("plumb_bob", "radtan", "radial-tangential", "brown_conrady", "modified_brown_conrady"), "radtan"),
@@ -170,7 +169,7 @@ def camera_of(
     lens = _LENSES.get(model.strip().lower().replace(" ", "_"))
     fx, fy, cx, cy = np.ravel(np.asarray(intrinsics, float)).tolist()
     pinhole = partial(Camera, width, height, fx, fy, cx, cy)
-    if width * height > _MOST_PIXELS:
+    if width * height > MOST_PIXELS:
         raise UserError(f"{name}: {width}x{height} pixels are absurd: the file is damaged")
     try:
         if not any(d) and lens not in ("fisheye", "double_sphere"):

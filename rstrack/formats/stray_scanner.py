@@ -21,6 +21,7 @@ from rsgen.errors import UserError
 from rsgen.files import listed_file, read_bytes, read_text
 from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png, png_fault
+from rsgen.sequence.trajectory import MAX_STAMP_S
 from rstrack.formats.pixels import check_size, decode, header_size
 from rstrack.formats.recording import (
     ARKIT_TRUTH,
@@ -38,7 +39,7 @@ from rstrack.formats.recording import (
 )
 
 _MILLIMETRES = 1000.0
-_MAX_STAMP_S, _MOST_FRAMES = 1e11, 10**9
+_MOST_FRAMES = 10**9
 # Kinds of the first box of a QuickTime or MP4 file. FFmpeg opens lists of other files, and addresses, by any name.
 _FIRST_BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _POSE, _INTRINSICS = ("x", "y", "z", "qx", "qy", "qz", "qw"), ("fx", "fy", "cx", "cy")
@@ -58,7 +59,9 @@ def read(path: Path, options: ReadOptions) -> Recording:
         raise UserError(f"{path / 'odometry.csv'}: lists no frame")
     each = [[row[name] for name in _INTRINSICS] for row in rows] if "fx" in rows[0] else [_matrix(path)]
     first = _depth_file(path, rows[0])
-    color = median_camera(str(path), _video_size(path / "rgb.mp4"), each)
+    with _Video(path / "rgb.mp4") as video:
+        size = int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+    color = median_camera(str(path), size, each)
     depth = resized(str(path), color, header_size(str(first), read_bytes(first)))
     imu = _table(path / "imu.csv", _IMU) if (path / "imu.csv").is_file() else []
     return Recording(
@@ -100,7 +103,7 @@ def _table(path: Path, wanted: Sequence[str]) -> list[dict[str, float]]:
         needed = [*wanted, *(_INTRINSICS if "fx" in names else ())]
         if not all(math.isfinite(row.get(name, math.nan)) for name in needed if name not in _POSE):
             raise UserError(f"{path} line {number}: expected numbers for {', '.join(needed)}")
-        if abs(row["timestamp"]) > _MAX_STAMP_S or not 0 <= row.get("frame", 0.0) < _MOST_FRAMES:
+        if abs(row["timestamp"]) > MAX_STAMP_S or not 0 <= row.get("frame", 0.0) < _MOST_FRAMES:
             raise UserError(f"{path} line {number}: no recording has that time or number of a frame: it is damaged")
         found.append({name: math.nan for name in names} | row)
     return found
@@ -113,11 +116,6 @@ def _matrix(path: Path) -> list[float]:
     except ValueError:
         raise UserError(f"{file}: expected the nine numbers of a camera matrix") from None
     return [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-
-
-def _video_size(path: Path) -> tuple[int, int]:
-    with _Video(path) as video:
-        return int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
 
 
 class _Video:

@@ -145,13 +145,17 @@ def color_image(
 
     evening (h, w): what intensities are multiplied by, since the camera darkens them.
     """
-    count = LEVELS + max(0, finer)
     grey = intensity(color)
-    levels = pyramid(grey if evening is None else grey * evening, count)
-    masks = _beyond_range(color, count)
+    levels = pyramid(grey if evening is None else grey * evening, LEVELS + max(0, finer))
     moments = np.array([levels[-1].mean(), levels[-1].std()], np.float64)
-    shown = (np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True))
-    return ColorImage(exposure, tuple(e.upload(level) for level in shown), moments, thumbnail(levels[-1]), finer)
+    shown = tuple(e.upload(level) for level in in_range(levels, color))
+    return ColorImage(exposure, shown, moments, thumbnail(levels[-1]), finer)
+
+
+def in_range(levels: list[npt.NDArray[np.float32]], color: npt.NDArray[np.uint8]) -> list[npt.NDArray[np.float32]]:
+    """Levels of a pyramid of intensities (h, w) of an image, NaN where that is saturated or black."""
+    masks = _beyond_range(color, len(levels))
+    return [np.where(mask, np.float32(np.nan), level) for level, mask in zip(levels, masks, strict=True)]
 
 
 def _beyond_range(color: npt.NDArray[np.uint8], count: int) -> list[npt.NDArray[np.bool_]]:

@@ -1,4 +1,4 @@
-"""How dense knots have to be for a motion, by the spectrum of an IMU's readings before anything is tracked.
+"""An IMU's readings: which of them count, and how dense knots have to be for the band of the motion that they show.
 
 A uniform spline of degree n with knots Δt apart misses of a wave of f Hz, at best and in the mean over its phases, the
 part 1 − sinc²ⁿ⁺²(f Δt) / Σ_k sinc²ⁿ⁺²(f Δt + k) of its power (Blu and Unser, Quantitative Fourier Analysis of
@@ -12,12 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import BoolArray, FloatArray
+from rsgen.geometry.spline import Spline
 from rstrack.alignment.priors import ACCELERATION
+from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.residuals import outliers
 from rstrack.options import Options
 
+# Part of a sensor's range from which on a reading is saturated, or may be.
+_SATURATED = 0.995
+# An outlier stands out from between its neighbours by so many σ of the noise, and so many times as far as the four
+# around it differ: motion that sudden would show in these, too. A bus that drops a bit leaves such readings.
+_SIGMAS, _TIMES = 20.0, 3.0
 # Spacings to choose from, s. No wider than without an IMU: a keyframe is made of a frame whose control points move no
 # more, which the camera leaves the further behind the wider they are apart.
 _SPACINGS_S = 0.025, 1 / 60, 0.0125, 1 / 120, 0.00625, 0.005
@@ -32,6 +38,76 @@ _RARE = 3.0
 _STRETCH_S = 1.0
 # Of the sum over k: what is left out is less than 1e-6 for lines (degree 1), and far less for the others.
 _ALIASES = np.arange(-50, 51)
+
+
+@dataclass(frozen=True)
+class ImuReadings:
+    """n of a unit's samples: t (n,) s, values (n, 6) = [gyro; accel], counts (n, 6): whether a reading does."""
+
+    t: FloatArray
+    values: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def of(cls, imu: ImuRecording) -> ImuReadings:
+        """All of a recording; saturated readings, outliers, and those that are not numbers do not count."""
+        gyro = np.full_like(imu.accel, np.nan) if imu.gyro is None else imu.gyro
+        values = np.concatenate([gyro, imu.accel], axis=1)
+        parts = zip((gyro, imu.accel), reading_sigmas(imu), strict=True)
+        with np.errstate(invalid="ignore"):
+            counts = np.isfinite(values) & within_range(values, imu.noise)
+            counts &= ~np.concatenate([outliers(part, sigma) for part, sigma in parts], axis=1)
+        return cls(np.asarray(imu.t, dtype=np.float64), np.where(counts, values, 0.0), counts.astype(np.float64))
+
+    def between(self, begin: float, end: float) -> ImuReadings:
+        """Those of begin ≤ t < end."""
+        return self[slice(*np.searchsorted(self.t, [begin, end]))]
+
+    def __getitem__(self, which: slice | BoolArray) -> ImuReadings:
+        return ImuReadings(self.t[which], self.values[which], self.counts[which])
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+def within_range(values: FloatArray, noise: ImuNoise) -> BoolArray:
+    """Which readings (n, 6) = [gyro; accel] are not saturated."""
+    limits = [np.inf if limit is None else _SATURATED * limit for limit in (noise.gyro_range, noise.accel_range)]
+    return np.asarray(np.abs(values) < np.repeat(limits, 3))
+
+
+def outliers(values: FloatArray, sigma: float) -> BoolArray:
+    """Which readings (n, 3), even ones, of noise sigma are. The first and the last two are not looked at, nor what is
+    beside no number."""
+    found = np.zeros(values.shape, dtype=bool)
+    if len(values) < 5:
+        return found
+    a, b, x, c, d = (values[i : len(values) - 4 + i] for i in range(5))
+    usual = np.abs(b - a) + np.abs(c - b) + np.abs(d - c)
+    found[2:-2] = np.abs(x - 0.5 * (b + c)) > _SIGMAS * sigma + _TIMES * usual
+    return found
+
+
+def reading_sigmas(recording: ImuRecording) -> FloatArray:
+    """σ (2,) of a gyroscope's reading (rad/s) and of an accelerometer's (m/s²), as stated."""
+    noise, root = recording.noise, np.sqrt(recording.rate_hz)
+    return np.array([noise.gyro_density, noise.accel_density]) * root
+
+
+def variance_about(dt: float, recording: ImuRecording, squares: FloatArray, count: FloatArray) -> FloatArray:
+    """Of either sensor's readings (2,) about a spline with knots dt s apart, by sums of `count` (2,) squared residuals.
+
+    Of noise a spline follows a part; what it cannot follow is all in the residuals.
+    """
+    followed = min(1.0, 1.0 / (recording.rate_hz * dt)) * reading_sigmas(recording) ** 2
+    return squares / np.maximum(1.0, count) + followed
+
+
+def guessed_gravity(spline: Spline, readings: ImuReadings, recording: ImuRecording) -> FloatArray:
+    """Gravity in the world (3,), m/s², if the mean force were nothing else."""
+    R = spline.pose(readings.t)[:, :3, :3] @ recording.T_imu_depth[:3, :3].T
+    up = (R @ readings.values[:, 3:, None])[..., 0].sum(axis=0)
+    return np.asarray(-recording.gravity * up / max(1e-9, float(np.linalg.norm(up))))
 
 
 def missed(x: FloatArray, degree: int) -> FloatArray:

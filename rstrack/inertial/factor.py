@@ -6,6 +6,9 @@
 a spline. `ImuFactor` takes it to the IMU by the adjoint of T_imu_depth, lever arm included. Tracking, refinement and
 calibration take from it the columns of what they estimate, and add biases and scales, which are linear.
 Left increments T ← exp(δ) T throughout, as for the images (docs/method.md).
+
+Tracking's are `ImuResiduals`: r = [ω + b_g − gyro; f + b_a − accel] of samples at their own stamps, of an IMU at
+exp([0; φ]) T_imu_depth: φ, an estimate's turn, turns it where it sits.
 """
 
 from __future__ import annotations
@@ -16,9 +19,12 @@ from functools import cached_property
 import numpy as np
 
 from rsgen.array_types import FloatArray, IntArray
-from rsgen.geometry import se3
+from rsgen.geometry import se3, so3
 from rsgen.geometry.so3 import cross, hat, powers
 from rsgen.geometry.spline import BASES, Spline
+from rstrack.alignment.normal_equations import Quadratic
+from rstrack.inertial.band import ImuReadings
+from rstrack.inertial.estimate import GRAVITY, SIZE, TURN, ImuEstimate
 
 
 @dataclass(frozen=True)
@@ -159,3 +165,106 @@ def _by_points(by_increments: FloatArray, gains: FloatArray) -> FloatArray:
         out[:, :, 6 * j : 6 * j + 6] -= part
         out[:, :, 6 * j + 6 : 6 * j + 12] += part
     return out
+
+
+# -- residuals ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ImuQuadratic:
+    """½ xᵀ H x + gᵀ x over control points from `first` on and, last, the numbers of a `ImuEstimate`; cost: at x = 0."""
+
+    first: int
+    H: FloatArray
+    g: FloatArray
+    cost: float
+
+    @property
+    def count(self) -> int:
+        """Control points."""
+        return (len(self.g) - SIZE) // 6
+
+    def without_imu(self, estimate: ImuEstimate, at: FloatArray) -> tuple[Quadratic, float, FloatArray]:
+        """Over the control points alone, the IMU's numbers, here around `at` (12,), being best at every step and known
+        beforehand as `estimate` says; the cost, and the best ones (12,) where no control point moves."""
+        off, points = at - estimate.mean, 6 * self.count
+        more = estimate.information, estimate.information @ off
+        H, g, step, gained = without(self.H, self.g, slice(points, None), slice(points), more)
+        cost = self.cost + 0.5 * float(off @ estimate.information @ off) - gained
+        return Quadratic(self.first, H, g), cost, at - step
+
+
+def without(
+    H: FloatArray, g: FloatArray, gone: slice, kept: slice, more: tuple[FloatArray, FloatArray] | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """½ xᵀ H x + gᵀ x of some numbers, the others (k) being best at every step: H and g.
+
+    Also what these are smaller by where they are best and no other moves (k,), and what that gains. more: H (k, k) and
+    g (k,) of what else is known of them.
+    """
+    own, gradient = (H[gone, gone], g[gone]) if more is None else (H[gone, gone] + more[0], g[gone] + more[1])
+    solved = np.linalg.solve(own, np.column_stack([H[gone, kept], gradient]))
+    rest, step = H[kept, kept] - H[kept, gone] @ solved[:, :-1], np.asarray(solved[:, -1])
+    return 0.5 * (rest + rest.T), g[kept] - H[kept, gone] @ step, step, 0.5 * float(gradient @ step)
+
+
+@dataclass(frozen=True)
+class ImuResiduals:
+    """Residuals of n samples, linearised: r (n, 6), J (n, 6, 36) their derivatives by the four control points and by a
+    estimate's numbers, first (n,) the first of these control points."""
+
+    samples: ImuReadings
+    r: FloatArray
+    J: FloatArray
+    first: IntArray
+
+    @classmethod
+    def of(cls, spline: Spline, samples: ImuReadings, T_imu_depth: FloatArray, estimate: FloatArray) -> ImuResiduals:
+        """Around a spline and an estimate's numbers (12,). All samples' times must be within the spline."""
+        turn = estimate[TURN]
+        a, b, c = so3.exp_coefficients(so3.squared_norm(turn))
+        T_imu_depth = np.concatenate([so3.polynomial(turn, a, b) @ T_imu_depth[:3], T_imu_depth[3:]])
+        at = ImuFactor(motion(spline, samples.t), T_imu_depth, estimate[GRAVITY])
+        J = np.zeros((len(samples), 6, 24 + SIZE))
+        J[:, :, :24] = at.by_motion
+        J[:, :, 24:30] = np.eye(6)
+        J[:, :, 30:33] = at.by_gravity
+        # exp(φ + δ) = exp(Jl(φ) δ) exp(φ).
+        J[:, :, 33:] = at.by_rotation @ so3.polynomial(turn, b, c)
+        return cls(samples, at.readings + estimate[:6] - samples.values, J, at.motion.first)
+
+    def until(self, end: float) -> ImuResiduals:
+        """Those of samples before a time, s."""
+        n = int(np.searchsorted(self.samples.t, end))
+        return ImuResiduals(self.samples[:n], self.r[:n], self.J[:n], self.first[:n])
+
+    def moved(self, first: int, increments: FloatArray) -> ImuResiduals:
+        """Where control points from number `first` on have moved by increments (k, 6)."""
+        step = increments[self.first[:, None] - first + np.arange(4)].reshape(len(self.r), 24, 1)
+        return ImuResiduals(self.samples, self.r + (self.J[:, :, :24] @ step)[..., 0], self.J, self.first)
+
+    def after(self, change: FloatArray) -> FloatArray:
+        """r (n, 6), where the estimate's numbers have changed by (12,), to first order in the turn."""
+        return self.r + self.J[:, :, 24:] @ change
+
+    def summed(self, sigma: FloatArray) -> ImuQuadratic | None:
+        """Their normal equations; None without samples.
+
+        sigma (2,): of a gyroscope's reading (rad/s), of an accelerometer's (m/s²).
+        """
+        if not len(self.r):
+            return None
+        root = self.samples.counts / np.repeat(sigma, 3)
+        whitened = np.concatenate([self.J, self.r[..., None]], axis=2) * root[..., None]
+        starts = np.flatnonzero(np.diff(self.first, prepend=self.first[0] - 1))
+        first, count = int(self.first[0]), int(self.first[-1] - self.first[0]) + 4
+        size = 6 * count + SIZE
+        total, tail = np.zeros((size + 1, size + 1)), slice(6 * count, None)
+        for begin, end in zip(starts, [*starts[1:], len(self.first)], strict=True):
+            rows = whitened[begin:end].reshape(-1, 24 + SIZE + 1)
+            squares, low = rows.T @ rows, 6 * (self.first[begin] - first)
+            # Slices are added faster than arrays of indices.
+            for to, own in ((slice(low, low + 24), slice(0, 24)), (tail, slice(24, None))):
+                total[to, tail] += squares[own, 24:]
+                total[to, low : low + 24] += squares[own, :24]
+        return ImuQuadratic(first, total[:-1, :-1], total[:-1, -1], 0.5 * float(total[-1, -1]))

@@ -13,9 +13,9 @@ from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.priors import ACCELERATION, acceleration_prior
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.recording import ImuRecording
-from rstrack.inertial.band import MotionBand
+from rstrack.inertial.band import ImuReadings, MotionBand, guessed_gravity, reading_sigmas, variance_about
 from rstrack.inertial.estimate import GRAVITY, GYRO, SIZE, ImuEstimate, estimate_dict
-from rstrack.inertial.residuals import ImuReadings, ImuResiduals, guessed_gravity, reading_sigmas
+from rstrack.inertial.factor import ImuResiduals
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 # σ of the mean acceleration of a track's first moments, m/s².
@@ -144,7 +144,7 @@ class Inertia:
         def around() -> tuple[Quadratic, float]:
             nonlocal numbers
             for _ in range(2):
-                joint, _ = self._rows(state, samples, numbers).summed(self.sigma)
+                joint = self._rows(state, samples, numbers).summed(self.sigma)
                 if joint is None:
                     return Quadratic(state.end - 1, np.zeros((6, 6)), np.zeros(6)), 0.0
                 model, cost, best = joint.without_imu(estimate, numbers)
@@ -182,7 +182,7 @@ class Inertia:
             cost = both.reach(state, both.first, state.end)
             rows = self._rows(state, samples, self.estimate.mean)
             self._ahead = state, both.first, both.at, rows
-            joint, _ = rows.summed(self.sigma)
+            joint = rows.summed(self.sigma)
             if joint is not None:
                 both.add(joint)
                 cost += joint.cost
@@ -220,7 +220,8 @@ class Inertia:
         self._leaves_open = bool(np.linalg.eigvalsh(_OPEN[:, None] * seen * _OPEN)[0] < 1.0)
         for model in models:
             smoother.add(model)
-        joint, scatter = self._rows_known(state, fresh).summed(self.sigma)
+        rows = self._rows_known(state, fresh)
+        joint = rows.summed(self.sigma)
         if joint is not None:
             smoother.add(joint)
             smoother.diffuse(self._walk * max(1e-6, float(self._until - begin)))
@@ -229,7 +230,7 @@ class Inertia:
         before = self.estimate.mean
         self._update(smoother)
         if joint is not None and self.is_informative:
-            self._learn_sigma(scatter.after(self.estimate.mean - before), fresh.counts, state.dt)
+            self._learn_sigma(rows.after(self.estimate.mean - before), fresh.counts, state.dt)
         if not self.is_usable:
             T, twist = state.spline.pose_and_velocity(self._until)
             R_imu_depth = self.recording.T_imu_depth[:3, :3]
@@ -289,12 +290,10 @@ class Inertia:
             self._sampled = np.full(2, _EXPECTED)
 
     def _learn_sigma(self, r: FloatArray, counts: FloatArray, dt: float) -> None:
-        # Of noise a spline follows a part; what it cannot follow is all in the residuals.
-        followed = min(1.0, 1.0 / (self.recording.rate_hz * dt)) * self._noise**2
         squares, number = (each.reshape(-1, 2, 3).sum(axis=(0, 2)) for each in (r**2 * counts, counts))
         self._sampled = np.minimum(self._sampled + number / 3.0, _MEMORY)
         weight = np.minimum(1.0, number / (3.0 * self._sampled))
-        seen = squares / np.maximum(1.0, number) + followed
+        seen = variance_about(dt, self.recording, squares, number)
         seen = np.minimum(seen, 25.0 * self.sigma**2)  # one blow must not blind it for long
         mean = np.where(number > 0.0, (1.0 - weight) * self.sigma**2 + weight * seen, self.sigma**2)
         self.sigma = np.maximum(self._noise, np.sqrt(mean))

@@ -16,7 +16,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.normal_equations import Quadratic
 from rstrack.alignment.spline_state import SplineState
 from rstrack.inertial.estimate import GRAVITY, SIZE, STRENGTH, ImuEstimate
-from rstrack.inertial.residuals import ImuQuadratic, without_tail
+from rstrack.inertial.factor import ImuQuadratic, without
 
 # Information of a control point that nothing observes (σ 100 m, rad): systems are never singular.
 _NOTHING = 1e-4
@@ -78,9 +78,9 @@ class Smoother:
         step; and how much less that costs here than the estimate does."""
         u, size = np.zeros(SIZE), float(np.linalg.norm(self.estimate[GRAVITY]))
         u[GRAVITY] = self.estimate[GRAVITY] / max(1e-9, size)
-        gradient = self.g[-SIZE:] + u * (size - strength) / STRENGTH**2
-        model, step = without_tail(self.first, self.H, self.g, np.outer(u, u) / STRENGTH**2, gradient)
-        return model, 0.5 * float(gradient @ step)
+        more, points = (np.outer(u, u) / STRENGTH**2, u * (size - strength) / STRENGTH**2), len(self.g) - SIZE
+        H, g, _, gained = without(self.H, self.g, slice(points, None), slice(points), more)
+        return Quadratic(self.first, H, g), gained
 
     def around(self, estimate: FloatArray) -> None:
         """Be around another estimate (12,)."""
@@ -138,11 +138,8 @@ class Smoother:
         count = 6 * min(max(0, first - self.first), len(self.at))
         if not count:
             return
-        solved = np.linalg.solve(self.H[:count, :count], np.column_stack([self.H[:count, count:], self.g[:count]]))
-        H = self.H[count:, count:] - self.H[count:, :count] @ solved[:, :-1]
-        self.g = self.g[count:] - self.H[count:, :count] @ solved[:, -1]
-        self.H, self.at = 0.5 * (H + H.T), self.at[count // 6 :]
-        self.first += count // 6
+        self.H, self.g, _, _ = without(self.H, self.g, slice(count), slice(count, None))
+        self.at, self.first = self.at[count // 6 :], self.first + count // 6
 
     def marginal(self) -> ImuEstimate:
         """The estimate."""

@@ -185,7 +185,7 @@ class SurfaceModel:
         made = self._maker.rectified(index, depth, colors, spline, older, as_now)
         if not self.volume.blocks:
             return made
-        seen, _ = self.volume.raycast(made.T_world_base, made.lens)
+        seen = self.volume.raycast(made.T_world_base, made.lens)
         e, shape = self._maker.e, (made.lens.camera.height, made.lens.camera.width)
         frame, model, weight = (e.download(a, shape) for a in (made.inverse_depth, seen, made.weight))
         z = np.divide(1.0, frame, out=np.zeros_like(frame), where=frame > 0)

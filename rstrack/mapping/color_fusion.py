@@ -13,7 +13,7 @@ image, weight = fusion.image(fused)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -70,16 +70,11 @@ def sweep_table(spline: Spline, exposure: Exposure) -> npt.NDArray[np.float64]:
     return np.asarray(exposure.lens.shutter.exposure_s * twist @ se3.adjoint(exposure.T_cam_body).T)
 
 
-@dataclass
 class ColorFusion:
     """Kernels for one blur σ in px; None: constant weights."""
 
-    e: Engine
-    sigma_px: float | None = SIGMA_PX
-    _kernel: Kernels = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._kernel = Kernels(self.e)
+    def __init__(self, e: Engine, sigma_px: float | None = SIGMA_PX) -> None:
+        self.e, self.sigma_px, self._kernel = e, sigma_px, Kernels(e)
 
     def start(self, ref: Reference) -> FusedColor:
         """Nothing but holes. `ref` is rectified."""
@@ -105,20 +100,18 @@ class ColorFusion:
         )
         inv_sigma2 = 0.0 if self.sigma_px is None else self.sigma_px**-2
         constants = e.upload(np.array([inv_sigma2, _LEAST, _MOST]))
-        *rgb, weight = kernel(
+        r, g, b, weight = kernel(
             _AddInput(ref.inverse_depth, *fused.rgb, fused.weight, image.rgb, depth.z, *tables, constants)
         )
-        return FusedColor((rgb[0], rgb[1], rgb[2]), weight, fused.shape)
+        return FusedColor((r, g, b), weight, fused.shape)
 
     def inherit(self, ref: Reference, older: FusedColor, older_ref: Reference) -> FusedColor:
         """What an older keyframe knows of the colours of a new one, with its weights."""
-        T_old_new = se3.inverse(older_ref.T_world_base) @ ref.T_world_base
-        pose = self.e.upload(rows_of(T_old_new))
+        pose = self.e.upload(rows_of(se3.inverse(older_ref.T_world_base) @ ref.T_world_base))
         kernel = self._kernel(_inherit_kernel, older_ref.lens, ref.lens)
         given = _InheritInput(ref.inverse_depth, *older.rgb, older.weight, older_ref.inverse_depth, pose)
-        *rgb, weight = kernel(given)
-        camera = ref.lens.camera
-        return FusedColor((rgb[0], rgb[1], rgb[2]), weight, (camera.height, camera.width))
+        r, g, b, weight = kernel(given)
+        return FusedColor((r, g, b), weight, (ref.lens.camera.height, ref.lens.camera.width))
 
     def image(self, fused: FusedColor) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
         """sRGB (h, w, 3), 0 in holes, and the sums of weights (h, w)."""

@@ -1,6 +1,6 @@
 """Keyframes of a sequence along a known spline, every frame's depth and colour fused in; as a TUM RGB-D folder.
 
-for done in fused_keyframes(dataset, spline, (None, 1.0)):
+for done in fused_keyframes(dataset, spline, (None, 1.0), Options(), lambda t: True):
     image, weight = done.colors[1.0]
 write_keyframes(open_dataset(Path("out/table1")), read_estimate(Path("runs/table1")), Path("keyframes"))
 """
@@ -62,22 +62,14 @@ class FusedKeyframe:
 
 
 def fused_keyframes(
-    dataset: Dataset,
-    spline: Spline,
-    sigmas: Sequence[BlurSigma],
-    options: Options | None = None,
-    frames: Sequence[int] | None = None,
-    covers: Callable[[float], bool] = lambda t: True,
+    dataset: Dataset, spline: Spline, sigmas: Sequence[BlurSigma], options: Options, covers: Callable[[float], bool],
     moving: MovingMasks | None = None,
-) -> Iterator[FusedKeyframe]:
+) -> Iterator[FusedKeyframe]:  # fmt: skip
     """Fuse every frame, in order, into the newest keyframe; its successor inherits depth, colour and weights.
 
-    spline: T_world_depth(t). frames: indices into the dataset, increasing (default: all). covers: whether the spline is
-    known at a time in s; frames of which it is not are left out. moving: what is left
-    out of them. A new keyframe is made at the distance or angle that
-    `options` say.
+    spline: T_world_depth(t). covers: whether the spline is known at a time in s; frames of which it is not are left
+    out. moving: what is left out of them. A new keyframe is made at the distance or angle that `options` say.
     """
-    options = options or Options()
     # Colour is wanted, whatever the tracker used.
     options = replace(options, method="rs-pg" if options.rolling else "gs-pg")
     e = engine(options.backend)
@@ -95,7 +87,7 @@ def fused_keyframes(
         images = {sigma: fusion.image(colors[sigma]) for sigma, fusion in fusions.items()}
         return FusedKeyframe(ref.index, ref, count, rho, single, images, viewer.image(most_blurred))
 
-    for k in range(len(dataset)) if frames is None else frames:
+    for k in range(len(dataset)):
         frame = dataset.frame(k)
         new = device.upload(k, frame)
         mask = None if moving is None else moving.grid(k)
@@ -134,7 +126,7 @@ def fused_keyframes(
         yield finished(ref)
 
 
-def depth_errors(dataset: Dataset, done: FusedKeyframe, options: Options | None = None) -> tuple[float, float, int]:
+def depth_errors(dataset: Dataset, done: FusedKeyframe, options: Options) -> tuple[float, float, int]:
     """RMSE in m of a keyframe's depth: of its frame alone, and fused; and over how many pixels.
 
     Against the noise-free depth of the same frame, rectified along the true spline to the middle of its readout: what
@@ -142,7 +134,6 @@ def depth_errors(dataset: Dataset, done: FusedKeyframe, options: Options | None 
     rsgen sequence.
     """
     assert dataset.sequence is not None and dataset.truth is not None
-    options = options or Options()
     e, device = engine(options.backend), DeviceRig(dataset.rig, options)
     exposure = device.upload(0, dataset.frame(done.index, color=False)).depth.exposure
     exact = depth_image(e, exposure, dataset.sequence.truth_depth(done.index), options.max_depth)
@@ -155,9 +146,8 @@ def depth_errors(dataset: Dataset, done: FusedKeyframe, options: Options | None 
 
 
 def write_keyframes(
-    dataset: Dataset, estimate: Estimate, out: Path, sigma_px: float | None = 1.0, options: Options | None = None,
-    progress: Progress = no_progress,
-) -> int:  # fmt: skip
+    dataset: Dataset, estimate: Estimate, out: Path, sigma_px: float | None = 1.0, progress: Progress = no_progress
+) -> int:
     """Write rgb/, depth/, weight/, rgb.txt, depth.txt, trajectory.txt and camera.yaml; returns how many keyframes.
 
     All are seen by one pinhole, at one moment each. Depth: 16 bit, 5000 units a metre; weights: 16 bit, 1000 for a
@@ -175,7 +165,8 @@ def write_keyframes(
     listings: dict[str, list[str]] = {"rgb.txt": [], "depth.txt": [], TRAJECTORY: []}
     camera = None
     covers = lambda t: bool(estimate.spline_covers(t))  # noqa: E731
-    for count, done in enumerate(fused_keyframes(dataset, spline, (sigma_px,), options, None, covers, estimate.moving)):
+    fused = fused_keyframes(dataset, spline, (sigma_px,), Options(), covers, estimate.moving)
+    for count, done in enumerate(fused):
         ref, (image, weight), name = done.reference, done.colors[sigma_px], f"{frame_name(count)}.png"
         z = np.divide(1.0, done.inverse_depth, out=np.zeros_like(done.inverse_depth), where=done.inverse_depth > 0)
         units = np.rint(DEPTH_SCALE * z.astype(np.float64))

@@ -21,7 +21,7 @@ from rsgen.device.lens import Lens
 from rsgen.device.projection import project_rolling
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rstrack.data.dataset import Dataset
+from rstrack.data.dataset import Dataset, open_tracked
 from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.rig import Frame, Rig
@@ -61,7 +61,7 @@ class Reconstruction:
 
 
 class FrameMapper:
-    """Frames of a rig, with the motion of an estimate, into a volume."""
+    """Frames of a rig, with the motion of an estimate, into a volume. rolling: with a pose for each line."""
 
     def __init__(
         self, device: DeviceRig, rig: Rig, estimate: Estimate, volume: Volume, T_world_estimate: FloatArray,
@@ -70,7 +70,7 @@ class FrameMapper:
         self._device, self._rig, self._estimate, self._max_depth = device, rig, estimate, max_depth
         self._volume, self._T_world_estimate = volume, T_world_estimate
         self.base = rectified_lens(rig.depth_camera)
-        self._kernel, self._rolling = Kernels(device.e), rolling
+        self._kernel, self._lines = Kernels(device.e), estimate.spline if rolling else None
 
     def __call__(self, frame: Frame, number: int) -> bool:
         """Integrate one frame of the data set without what moves by itself; False if the estimate does not cover it.
@@ -88,11 +88,8 @@ class FrameMapper:
         # Its colours are taken a little later, and from beside: what is next to it is seen better by other frames.
         moving = self._estimate.moving.of(number, camera.height, camera.width, round(MARGIN * camera.width))
         depth = depth_image(e, exposure, z if moving is None else np.where(moving, 0.0, z), self._max_depth)
-        if self._rolling:
-            assert self._estimate.spline is not None
-            seen_at = to_base_table(self._estimate.spline, T_estimate_base, exposure)
-        else:
-            seen_at = IDENTITY_TO_BASE
+        lines = self._lines
+        seen_at = IDENTITY_TO_BASE if lines is None else to_base_table(lines, T_estimate_base, exposure)
         rectify = self._kernel(rectify_kernel, device.depth_lens, self.base)
         rho, _, _ = rectify(RectifyInput(depth.inverse_z, *device.device_rays, e.upload(seen_at)))
         self._volume.integrate(
@@ -108,9 +105,8 @@ class FrameMapper:
             return None
         best = min(usable, key=lambda i: abs(exposures[i].mid_time - t))
         exposure, e = exposures[best], self._device.e
-        if self._rolling:
-            assert self._estimate.spline is not None
-            from_base = from_base_table(self._estimate.spline, T_estimate_base, exposure)
+        if self._lines is not None:
+            from_base = from_base_table(self._lines, T_estimate_base, exposure)
         else:
             T = self._rig.T_color_depth @ se3.inverse(self._pose(exposure.mid_time)) @ T_estimate_base
             from_base = np.concatenate([rows_of(T), np.zeros(6)])
@@ -207,8 +203,6 @@ def run_map(
 
     Arguments as in `reconstruct`, `read_estimate` and `rstrack.data.dataset.open_tracked`. Raises UserError.
     """
-    from rstrack.data.dataset import open_tracked
-
     for path in (out, cloud):
         if path is not None and path.suffix.lower() != ".ply":
             raise UserError(f"{path}: only PLY is written: give it a name that ends in .ply")

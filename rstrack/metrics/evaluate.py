@@ -227,12 +227,21 @@ def pairs_apart(stamps: FloatArray, seconds: float) -> tuple[IntArray, IntArray]
     return np.flatnonzero(keep), j[keep]
 
 
+def motions(T_world_cam: FloatArray, i: IntArray, j: IntArray) -> FloatArray:
+    """T_i⁻¹ T_j (k, 4, 4) between poses i and j (k,) of (n, 4, 4)."""
+    return se3.inverse(T_world_cam[i]) @ T_world_cam[j]
+
+
+def pose_errors(T_a: FloatArray, T_b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Translations (n,), m, and angles (n,), degrees, of T_a⁻¹ T_b, both (n, 4, 4)."""
+    return np.linalg.norm((se3.inverse(T_a) @ T_b)[:, :3, 3], axis=1), angles_deg(T_a, T_b)
+
+
 def drift(estimate: Estimate, found: Comparison) -> RelativeErrors:
     """The relative pose errors whose RMS `evaluate` gives, with the time at which each second begins."""
     i, j = _pairs(estimate, found, 1.0)
-    true_step = se3.inverse(found.T_world_true[i]) @ found.T_world_true[j]
-    est_step = se3.inverse(found.T_world_est[i]) @ found.T_world_est[j]
-    return RelativeErrors(estimate.stamps[found.index[i]], *_pose_errors(true_step, est_step))
+    true_step, est_step = (motions(T, i, j) for T in (found.T_world_true, found.T_world_est))
+    return RelativeErrors(estimate.stamps[found.index[i]], *pose_errors(true_step, est_step))
 
 
 def _pairs(estimate: Estimate, found: Comparison, seconds: float) -> tuple[IntArray, IntArray]:
@@ -278,13 +287,8 @@ def _errors_by_line(
     t = t[(t >= motion.t_begin) & (t <= motion.t_end) & estimate.spline_covers(t)]
     if not t.size:
         return (None, None), 0
-    position, angle = _pose_errors(motion.pose(t), T_true_est @ estimate.spline.pose(t))
+    position, angle = pose_errors(motion.pose(t), T_true_est @ estimate.spline.pose(t))
     return (_rms(position), _rms(angle)), t.size
-
-
-def _pose_errors(T_a: FloatArray, T_b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Translations (n,), m, and angles (n,), degrees, of T_a⁻¹ T_b, both (n, 4, 4)."""
-    return np.linalg.norm((se3.inverse(T_a) @ T_b)[:, :3, 3], axis=1), angles_deg(T_a, T_b)
 
 
 def _rms(values: FloatArray) -> float:

@@ -1,15 +1,17 @@
-"""`rstrack evaluate`: an estimate against a sequence's truth or a file of poses, and what clock and extrinsics change.
+"""`rstrack evaluate`: a run against the truth of its sequence or a file of poses, and what clock and extrinsics change.
 
 evaluation = run_evaluate(Path("fr1_rpy"), Path("runs/fr1_rpy"), truth_offset="auto")
 print(evaluation.text())
+tracked = load_run(Path("runs/fr1_rpy"))       # what pictures and pages are made from
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,13 +19,26 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import read_trajectory
-from rstrack.data.dataset import open_tracked
+from rstrack.data.dataset import Dataset, open_tracked
 from rstrack.data.estimate import Estimate, read_estimate, write_info
-from rstrack.metrics.association import Truth, compare, truth_of
-from rstrack.metrics.clock import ClockFit, TruthOffset, fit_clock, shifted
+from rstrack.metrics.association import Comparison, Truth, compare, truth_of
 from rstrack.metrics.consistency import TruthNoise
 from rstrack.metrics.evaluate import Metrics, evaluate
-from rstrack.metrics.extrinsics import ExtrinsicsFit, TruthExtrinsics, fit_extrinsics, mounted
+from rstrack.metrics.truth_fit import (
+    ClockFit,
+    ExtrinsicsFit,
+    TruthExtrinsics,
+    TruthOffset,
+    fit_clock,
+    fit_extrinsics,
+    mounted,
+    shifted,
+)
+
+Found = TypeVar("Found")
+
+# Points of the true path, of which there is one at any time.
+_PATH_POINTS = 1000
 
 
 @dataclass(frozen=True)
@@ -46,11 +61,7 @@ class RunEvaluation:
     @property
     def chosen(self) -> Metrics:
         """The errors that were asked for."""
-        return self.mounted or self._on_the_clock
-
-    @property
-    def _on_the_clock(self) -> Metrics:
-        return self.moved if self.asked and self.moved is not None else self.metrics
+        return self.mounted or (self.moved if self.asked and self.moved is not None else self.metrics)
 
     @property
     def truth_offset(self) -> dict[str, Any] | None:
@@ -132,7 +143,8 @@ def add_errors(run: Path, truth: Truth | None, estimate: Estimate, online: Estim
 
     online: the track before it was corrected. Raises UserError.
     """
-    evaluation, before = evaluated(truth, estimate), None if online is None else _metrics(truth, online)
+    evaluation = evaluated(truth, estimate)
+    before = None if online is None else _or_none(evaluate, truth, online)
     errors: dict[str, Any] = {
         "metrics": None if evaluation is None else evaluation.metrics.as_dict(),
         "truth_offset": None if evaluation is None else evaluation.truth_offset,
@@ -146,18 +158,7 @@ def add_errors(run: Path, truth: Truth | None, estimate: Estimate, online: Estim
 
 def evaluated(truth: Truth | None, estimate: Estimate) -> RunEvaluation | None:
     """`evaluate_clocks`; None without a truth, and where fewer than three poses have a true counterpart."""
-    try:
-        return None if truth is None else evaluate_clocks(truth, estimate)
-    except UserError:
-        return None
-
-
-def _metrics(truth: Truth | None, estimate: Estimate) -> Metrics | None:
-    """`evaluate` with the clocks as they are; None as `evaluated`."""
-    try:
-        return None if truth is None else evaluate(truth, estimate)
-    except UserError:
-        return None
+    return _or_none(evaluate_clocks, truth, estimate)
 
 
 def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None = None) -> RunEvaluation:
@@ -169,7 +170,7 @@ def evaluate_clocks(truth: Truth, estimate: Estimate, offset: TruthOffset | None
     """
     metrics = evaluate(truth, estimate)
     if offset is None:
-        fit = None if isinstance(truth.motion, Spline) else _fit_or_none(truth, estimate)
+        fit = None if isinstance(truth.motion, Spline) else _or_none(fit_clock, truth, estimate)
         if fit is None or not fit.is_clear:
             return RunEvaluation(metrics)
         return RunEvaluation(metrics, fit.offset_s, evaluate(shifted(truth, fit.offset_s), estimate), fit)
@@ -231,9 +232,10 @@ def _truth(path: Path, run: Path, estimate: Estimate, camera_file: Path | None) 
     return truth
 
 
-def _fit_or_none(truth: Truth, estimate: Estimate) -> ClockFit | None:
+def _or_none(compared: Callable[[Truth, Estimate], Found], truth: Truth | None, estimate: Estimate) -> Found | None:
+    """What a comparison finds; None without a truth, and where it raises UserError."""
     try:
-        return fit_clock(truth, estimate)
+        return None if truth is None else compared(truth, estimate)
     except UserError:
         return None
 
@@ -243,3 +245,96 @@ def _short(m: Metrics) -> str:
     if m.rpe_trans_rmse_m_per_s is not None and m.rpe_rot_rmse_deg_per_s is not None:
         parts += [f"{1e3 * m.rpe_trans_rmse_m_per_s:.2f} mm/s", f"{m.rpe_rot_rmse_deg_per_s:.3f} deg/s"]
     return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """One estimate and what it is compared with; dataset, truth, found: None where they cannot be had.
+
+    notes: why not.
+    """
+
+    estimate: Estimate
+    dataset: Dataset | None = None
+    truth: Truth | None = None
+    found: Comparison | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def path(self) -> tuple[FloatArray, FloatArray]:
+        """Stamps (n,) s and T_world_depth (n, 4, 4) of the estimate, in the truth's world where there is one."""
+        T = self.estimate.T_world_depth
+        return self.estimate.stamps, T if self.found is None else self.found.T_true_est @ T
+
+    @property
+    def begin_s(self) -> float:
+        """Stamp of the first frame, s; of the first pose where the run does not list its frames."""
+        return float(self.frames[0]["stamp"] if self.frames else self.estimate.stamps[0])
+
+    @property
+    def frames(self) -> list[dict[str, Any]]:
+        """The tracker's diagnostics, one dict a frame."""
+        frames = self.estimate.info.get("frames")
+        if not isinstance(frames, list):
+            return []
+        return [f for f in frames if isinstance(f, dict) and isinstance(f.get("stamp"), int | float)]
+
+
+def load_run(
+    run: Path, sequence: Path | None = None, camera_file: Path | None = None, dataset: Dataset | None = None,
+    truth_offset: TruthOffset | None = None,
+) -> Tracked:  # fmt: skip
+    """Read a run folder and compare it with the truth of its sequence.
+
+    sequence: the folder where the sequence is; by default the one that run.json names, and if that is gone there is no
+    comparison. camera_file: see `rstrack.data.dataset.open_tracked`. dataset: the same, already open. truth_offset: of
+    the truth's clock, see `aligned_clock`. Raises UserError: no run, a given sequence cannot be read, no
+    such offset is found.
+    """
+    estimate = read_estimate(run)
+    notes: list[str] = []
+    if dataset is None:
+        dataset = _dataset(run, estimate, sequence, camera_file, notes)
+    if dataset is None:
+        return Tracked(estimate, notes=tuple(notes))
+    truth = truth_of(dataset)
+    if truth is None:
+        notes.append(f"The sequence {dataset.name} has no ground truth, so there are no errors to show.")
+        return Tracked(estimate, dataset, notes=tuple(notes))
+    truth = aligned_clock(truth, estimate, truth_offset)
+    try:
+        found = compare(truth, estimate)
+    except UserError as error:
+        return Tracked(estimate, dataset, truth, notes=(*notes, f"No errors: {error}."))
+    return Tracked(estimate, dataset, truth, found, tuple(notes))
+
+
+def true_path(truth: Truth, begin: float, end: float) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) s within [begin, end] and poses T_world_depth (n, 4, 4) of the true path there."""
+    motion = truth.motion
+    if not isinstance(motion, Spline):
+        inside = (motion.stamps >= begin - 1e-6) & (motion.stamps <= end + 1e-6)
+        return motion.stamps[inside], motion.T_world_cam[inside]
+    t = np.linspace(max(begin, motion.t_begin), min(end, motion.t_end), _PATH_POINTS)
+    return t, motion.pose(t)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _dataset(
+    run: Path, estimate: Estimate, sequence: Path | None, camera_file: Path | None, notes: list[str]
+) -> Dataset | None:
+    if sequence is not None:
+        return open_tracked(sequence, run, estimate.info, camera_file)
+    recorded = estimate.info.get("dataset")
+    path = recorded.get("path") if isinstance(recorded, dict) else None
+    if not isinstance(path, str):
+        notes.append("The run does not state where its sequence is, so there are no errors and no images: name it with "
+                     "--sequence.")  # fmt: skip
+        return None
+    try:
+        return open_tracked(Path(path), run, estimate.info, camera_file)
+    except UserError as error:
+        notes.append(f"No errors and no images: {error}. If the sequence has moved, name it with --sequence.")
+        return None

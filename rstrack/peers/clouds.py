@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from rsgen.geometry import se3
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.options import CLOUD_PEERS, Options
-from rstrack.peers.peer import chosen_frames, run_info, timed_frames
+from rstrack.peers.peer import readout_s, run_info, timed_frames
 
 # Pixels of a depth image are thinned out to about so many.
 _POINTS = 40_000
@@ -31,21 +31,11 @@ _NEAREST_M = 0.1
 _PACKAGES = {"kiss-icp": "kiss-icp", "small-gicp": "small_gicp"}
 
 
-class CloudTracker(Protocol):
-    """A peer. settings: for run.json."""
-
-    settings: dict[str, float]
-
-    def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
-        """T_world_cam (4, 4) at the last line, from points (n, 3) in m that were seen at times `line` (n,), see
-        `cloud_of`."""
-
-
 class KissIcp:
     """KISS-ICP (Vizzo et al., RA-L 2023): point to point against a voxel map, deskewed to the end of each scan.
 
     It takes a scan to last as long as the time between two, whatever it is given: shorter readouts are deskewed too
-    much.
+    much. settings: for run.json.
     """
 
     def __init__(self, max_depth: float) -> None:
@@ -59,7 +49,8 @@ class KissIcp:
         self._odometry = module.KissICP(config)
 
     def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
-        """See `CloudTracker`."""
+        """T_world_cam (4, 4) at the last line, from points (n, 3) in m that were seen at times `line` (n,), see
+        `cloud_of`."""
         # It stretches the times to 0..1: where all are alike, which it would divide by, nothing is to be deskewed.
         self._odometry.register_frame(p_cam, line if np.ptp(line) > 0.0 else np.empty(0))
         return np.array(self._odometry.last_pose)
@@ -76,7 +67,7 @@ class SmallGicp:
         self._T_world_key = self._T_world_last = self._delta = np.eye(4)
 
     def register(self, p_cam: FloatArray, line: FloatArray) -> FloatArray:
-        """See `CloudTracker`."""
+        """See `KissIcp`."""
         points = deskewed(p_cam, line, self._delta)
         cloud = self._gicp.preprocess_points(points, self.settings["downsampling_resolution"])
         if self._key is None:
@@ -116,7 +107,7 @@ def run_cloud_peer(
 
     Raises UserError: unknown name, the peer is not installed, no such frames, an image cannot be read or holds nothing.
     """
-    chosen, tracker = chosen_frames(dataset, frames), _tracker(name)
+    chosen, tracker = dataset.chosen(frames), _tracker(name)
     poses: list[FloatArray] = []
 
     def feed(k: int, cloud: tuple[FloatArray, FloatArray]) -> None:
@@ -127,7 +118,7 @@ def run_cloud_peer(
     begin = time.perf_counter()
     seconds = timed_frames(name, chosen, cloud_of(dataset), feed, progress)
     stamps = dataset.stamps[chosen]
-    T_world_depth = se3.interpolated(stamps + _last_line(dataset), np.array(poses), stamps)
+    T_world_depth = se3.interpolated(stamps + readout_s(dataset, 1.0), np.array(poses), stamps)
     info = run_info(name, {_PACKAGES[name]: version(_PACKAGES[name])}, "on the CPU", dataset, chosen, begin, seconds)
     info |= {"settings": tracker.settings, "keyframes": 0, "lost": 0}
     return Estimate(stamps, se3.orthonormalise(T_world_depth), info=info)
@@ -140,7 +131,7 @@ def cloud_of(dataset: Dataset) -> Callable[[int], tuple[FloatArray, FloatArray]]
     stride = max(1, round(np.sqrt(camera.width * camera.height / _POINTS)))
     uv = camera.pixel_grid()[::stride, ::stride].reshape(-1, 2)
     rays = camera.unproject(uv)
-    before_s = _last_line(dataset) - shutter.line_mid_time(0.0, shutter.line_of_pixel(uv, camera), camera)
+    before_s = readout_s(dataset, 1.0) - shutter.line_mid_time(0.0, shutter.line_of_pixel(uv, camera), camera)
     line = np.maximum(0.0, 1.0 - before_s / float(np.median(np.diff(dataset.stamps))))
     longest = Options().max_depth
 
@@ -152,7 +143,7 @@ def cloud_of(dataset: Dataset) -> Callable[[int], tuple[FloatArray, FloatArray]]
     return cloud
 
 
-def _tracker(name: str) -> CloudTracker:
+def _tracker(name: str) -> KissIcp | SmallGicp:
     if name not in CLOUD_PEERS:
         raise UserError(f"unknown peer '{name}': choose {', '.join(CLOUD_PEERS)}")
     return KissIcp(Options().max_depth) if name == "kiss-icp" else SmallGicp(Options())
@@ -165,9 +156,3 @@ def _module(name: str, package: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise UserError(f"the peer needs {package} ({error}): {how_to_install('peers', package=package)}") from None
-
-
-def _last_line(dataset: Dataset) -> float:
-    """Seconds from a depth frame's stamp to the middle of its last line's exposure."""
-    camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    return float(shutter.line_mid_time(0.0, shutter.line_count(camera) - 1.0, camera))

@@ -22,7 +22,7 @@ from rstrack.data.dataset import Dataset, registered_image
 from rstrack.data.estimate import Estimate
 from rstrack.data.registration import RegisteredImage, Registrar
 from rstrack.options import PEERS, Options
-from rstrack.peers.peer import chosen_frames, mid_readout_s, run_info, timed_frames
+from rstrack.peers.peer import readout_s, run_info, timed_frames
 
 _KEYFRAME = "-keyframe"
 # Part of the pixels that must have found a partner, and frames in a row without, after which the reference is given up.
@@ -145,7 +145,7 @@ def run_peer(name: str, dataset: Dataset, frames: slice = slice(None), progress:
 
     Raises UserError: unknown name, Open3D cannot be loaded, no such frames, an image cannot be read, all were lost.
     """
-    chosen, registrar = chosen_frames(dataset, frames), Registrar(dataset.rig)
+    chosen, registrar = dataset.chosen(frames), Registrar(dataset.rig)
     tracker = PeerTracker(name, registrar.camera)
     begin = time.perf_counter()
     seconds = timed_frames(
@@ -155,7 +155,7 @@ def run_peer(name: str, dataset: Dataset, frames: slice = slice(None), progress:
     if not tracker.poses:
         raise UserError(f"{dataset.root}: {name} found no pose: the depth images hold next to nothing")
     stamps = np.array(tracker.stamps)
-    T_world_depth = se3.interpolated(stamps + mid_readout_s(dataset), np.array(tracker.poses), stamps)
+    T_world_depth = se3.interpolated(stamps + readout_s(dataset, 0.5), np.array(tracker.poses), stamps)
     info = run_info(name, {"open3d": version("open3d")}, "Open3D on the CPU", dataset, chosen, begin, seconds)
     frames_told = [
         {

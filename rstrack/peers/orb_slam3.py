@@ -36,7 +36,7 @@ from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.image_files import prefetched
 from rstrack.data.registration import RegisteredImage, Registrar
 from rstrack.options import Options
-from rstrack.peers.peer import chosen_frames, mid_readout_s, run_info, run_logged
+from rstrack.peers.peer import readout_s, run_info, run_logged
 
 NAME = "orb-slam3"
 VOCABULARY = "RSTRACK_ORB_VOCABULARY"
@@ -60,7 +60,7 @@ def run_orb_slam3(
     readout, and interpolated to the stamp. seed: of the vocabulary. Raises UserError: it is not installed, no such
     frames, an image cannot be read, its process fails, nothing was tracked.
     """
-    chosen = chosen_frames(dataset, frames)
+    chosen = dataset.chosen(frames)
     if find_spec("pyorbslam3") is None:
         raise UserError(f"the peer needs pyorbslam3 (GPL): {how_to_install('orbslam3')}")
     registrar = Registrar(dataset.rig)
@@ -83,7 +83,7 @@ def run_orb_slam3(
     nearest = np.abs(dataset.stamps[chosen][None] - found.stamps[:, None]).argmin(axis=1)
     # Its file has microseconds only.
     stamps, first = np.unique(dataset.stamps[chosen][nearest], return_index=True)
-    T_world_depth = se3.interpolated(stamps + mid_readout_s(dataset), found.T_world_depth[first], stamps)
+    T_world_depth = se3.interpolated(stamps + readout_s(dataset, 0.5), found.T_world_depth[first], stamps)
     info = run_info(NAME, {"pyorbslam3": version("pyorbslam3")}, "on the CPU", dataset, chosen, begin, 1e-3 * ms)
     info |= {"settings": SETTINGS, "keyframes": 0, "lost": int((~tracked).sum())}
     return Estimate(stamps, se3.orthonormalise(T_world_depth), info=info)

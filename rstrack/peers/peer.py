@@ -79,14 +79,6 @@ def run_logged(words: Sequence[str], log: Path, folder: Path | None = None) -> s
     return f"ended with status {done.returncode}: {last}" if done.returncode else ""
 
 
-def chosen_frames(dataset: Dataset, frames: slice) -> range:
-    """The frames of a dataset. Raises UserError: there are none."""
-    chosen = range(len(dataset))[frames]
-    if not len(chosen):
-        raise UserError(f"{dataset.root}: has no frame {frames.start}: its frames are 0 to {len(dataset) - 1}")
-    return chosen
-
-
 def timed_frames(
     name: str, chosen: range, read: Callable[[int], Input], feed: Callable[[int, Input], object], progress: Progress
 ) -> list[float]:
@@ -102,10 +94,10 @@ def timed_frames(
     return seconds
 
 
-def mid_readout_s(dataset: Dataset) -> float:
-    """Seconds from a depth frame's stamp to the middle of its readout."""
+def readout_s(dataset: Dataset, part: float) -> float:
+    """Seconds from a depth frame's stamp to the middle exposure of its last line (part 1), or a part of the way."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
-    return float(shutter.line_mid_time(0.0, 0.5 * (shutter.line_count(camera) - 1), camera))
+    return float(shutter.line_mid_time(0.0, part * (shutter.line_count(camera) - 1), camera))
 
 
 def run_info(

@@ -11,8 +11,8 @@ from pathlib import Path
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.tables import Table, fixed
 from rsgen.errors import UserError
-from rstrack.bench.experiments.method_results import AVERAGE, RESULTS, Results, read_results
 from rstrack.bench.experiments.method_tables import notes, sequence_table
+from rstrack.bench.experiments.methods import AVERAGE, RESULTS, Results, read_results
 from rstrack.bench.experiments.pictures import ate_chart, read_picture, shown_runs
 from rstrack.bench.experiments.stress import PATHS, StressResult, read_stress
 from rstrack.bench.experiments.stress_results import (
@@ -27,7 +27,7 @@ from rstrack.bench.measures.blur import PANELS, read_panels
 from rstrack.bench.tables import ERRORS
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.data.dataset import open_dataset
-from rstrack.metrics.tracked import Tracked
+from rstrack.metrics.run_evaluate import Tracked
 from rstrack.report.page import (
     Block,
     Card,
@@ -40,9 +40,10 @@ from rstrack.report.page import (
     PageSection,
     Plot,
     Slider,
+    number,
+    plots,
 )
 from rstrack.report.pictures import frame_panels, jpeg_uri, map_pictures, shutter_sliders
-from rstrack.report.run import number, plots
 
 OURS = "rs-pg"
 _TITLES = {

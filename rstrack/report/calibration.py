@@ -9,7 +9,8 @@ import numpy as np
 
 from rsgen.console.tables import Entry, Table, fixed, significant
 from rstrack.calibration.record import CalibrationRecord, Change, LensMap, Parameter
-from rstrack.charts.chart import COLORS, ChangeChart, Curve, LensChart, MovedValue, StripChart, broken
+from rstrack.charts.chart import COLORS, Curve, broken
+from rstrack.charts.to_page import MovedValue, PageChart, change_figure, lens_figure, strip_figure
 from rstrack.report.page import Block, Card, CardRow, Note, Page, PageSection, Plot, TextFile
 
 _BEFORE = (
@@ -105,7 +106,7 @@ def _values(record: CalibrationRecord) -> tuple[Block, ...]:
     rows = tuple(_row(p) for p in record.parameters.values())
     notes = (Note(f"{text[0].upper()}{text[1:]}.") for text in record.notes)
     lenses = (Note(f"{name.capitalize()} lens: {text}.") for name, text in record.lenses_px.items())
-    pictures = (Plot(chart) for chart in lens_charts(record))
+    pictures = (Plot(_lens_chart(name, lens)) for name, lens in record.lens_maps.items() if lens.at_px)
     table = Table(head, rows, "Found, and where it began")
     return table, Note(_SIGMA), *lenses, *notes, Plot(change_chart(record)), *pictures
 
@@ -163,12 +164,8 @@ def _camera_file(record: CalibrationRecord) -> tuple[Block, ...]:
         "rstrack track RECORDING --camera camera.yaml --out RUN tracks with it.")  # fmt: skip
 
 
-def lens_charts(record: CalibrationRecord) -> tuple[LensChart, ...]:
-    """Where each lens that was looked for puts points, against what it began with."""
-    return tuple(_lens_chart(name, lens) for name, lens in record.lens_maps.items() if lens.at_px)
-
-
-def _lens_chart(name: str, lens: LensMap) -> LensChart:
+def _lens_chart(name: str, lens: LensMap) -> PageChart:
+    """Where a lens that was looked for puts points, against what it began with."""
     at, moved = np.array(lens.at_px), np.array(lens.moved_px)
     longest = float(np.linalg.norm(moved, axis=1).max())
     spacing = float(np.diff(np.unique(at[:, 0])).min(initial=np.inf))
@@ -177,10 +174,11 @@ def _lens_chart(name: str, lens: LensMap) -> LensChart:
         f"From where the lens before had a point of the scene, a dot, to where the new one has it: {longest:.2g} px at "
         f"most, drawn {magnified:.2g} times as long. Colour: 2 σ of that place."
     )
-    return LensChart(f"The {name} camera's lens", at, moved, 2.0 * np.array(lens.sigma_px)[:, 0], magnified, note)
+    figure = lens_figure(at, moved, 2.0 * np.array(lens.sigma_px)[:, 0], magnified)
+    return PageChart(f"The {name} camera's lens", figure, note)
 
 
-def change_chart(record: CalibrationRecord) -> ChangeChart:
+def change_chart(record: CalibrationRecord) -> PageChart:
     """Values against what they were before."""
     by_unit: dict[str, list[MovedValue]] = {}
     for p in record.parameters.values():
@@ -189,10 +187,10 @@ def change_chart(record: CalibrationRecord) -> ChangeChart:
         "Zero is where a value began; whiskers are 2 σ, often narrower than the dot. Hollow: undetermined, it has "
         "stayed where it was."
     )
-    return ChangeChart("How far values moved from their starts", tuple((u, tuple(m)) for u, m in by_unit.items()), note)
+    return PageChart("How far values moved from their starts", change_figure(by_unit), note)
 
 
-def strip_chart(record: CalibrationRecord) -> StripChart:
+def strip_chart(record: CalibrationRecord) -> PageChart:
     """Which windows of the recording determine each value, and how the camera moved there."""
     found = [p for p in record.parameters.values() if p.is_found]
     parts = np.array([p.told_by_stretch for p in found]).reshape(len(found), len(record.stretches))
@@ -207,10 +205,9 @@ def strip_chart(record: CalibrationRecord) -> StripChart:
         "known. Between the windows nothing was used. Below, how fast the camera moves and turns, by the first rough "
         "track; it is broken where that was lost."
     )
-    return StripChart(
-        "Where in the recording values are determined", tuple(p.shown.label for p in found),
-        np.array(record.stretch_times_s).reshape(-1, 2), parts, curves, "time since the first frame, s", note,
-    )  # fmt: skip
+    names, spans = [p.shown.label for p in found], np.array(record.stretch_times_s).reshape(-1, 2)
+    figure = strip_figure(names, spans, parts, curves, "time since the first frame, s")
+    return PageChart("Where in the recording values are determined", figure, note)
 
 
 def _moved(p: Parameter) -> MovedValue:

@@ -16,9 +16,8 @@ from rstrack.bench.figures import figure_of, heading
 from rstrack.charts.chart import Chart, Curve, method_colors, numbers
 from rstrack.charts.to_file import write_charts
 from rstrack.report.page import Chooser, ImageRow, Note, Page, PageImage, PageSection, Sortable
-from rstrack.score.results import MethodResults
-from rstrack.score.scores import FIGURES, Scores, SequenceScored
-from rstrack.score.suite import SuiteEntry
+from rstrack.score.scores import FIGURES, Scores
+from rstrack.score.suite import MethodResults, SuiteEntry
 
 _BY_READOUT = ("ate_mm", "drift_mm_s")
 _ABOUT = (
@@ -136,9 +135,8 @@ def _ladder(entry: SuiteEntry) -> str:
 
 def _by_readout(scores: Scores, group: str) -> PageImage | None:
     """Errors over the readout of a group's sequences; None where no method has any."""
-    ladder = sorted(
-        (s for s in scores.sequences if _ladder(s.entry) == group and s.readout_ms is not None), key=_readout
-    )
+    ladder = [s for s in scores.sequences if _ladder(s.entry) == group and s.readout_ms is not None]
+    ladder.sort(key=lambda s: s.readout_ms or 0.0)
     keys, x = [method.key for method in scores.methods], numbers([s.readout_ms for s in ladder])
     colors = method_colors(keys)
     # There are fewer colours than methods may be.
@@ -158,10 +156,6 @@ def _by_readout(scores: Scores, group: str) -> PageImage | None:
     if not charts:
         return None
     return PageImage(_svg_uri(charts), group, f"{group}: errors over the readout of every method")
-
-
-def _readout(scored: SequenceScored) -> float:
-    return scored.readout_ms or 0.0
 
 
 def _svg_uri(charts: Sequence[Chart]) -> str:

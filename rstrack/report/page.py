@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import base64
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
 from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
 from rsgen.console.tables import Table
-from rstrack.charts.chart import AnyChart, Chart, PathChart
-from rstrack.charts.to_page import PlotlyFigure, figure_of
+from rsgen.files import atomic_write, make_folder
+from rstrack.charts.chart import Chart, PathChart
+from rstrack.charts.to_page import AnyChart, PlotlyFigure, figure_of
 from rstrack.data.estimate import plain
 
 
@@ -150,6 +154,19 @@ class Page:
     made_with: str = ""
 
 
+def plots(charts: Sequence[Chart | PathChart], points: int = 1500) -> tuple[Plot, ...]:
+    """A block for each chart."""
+    return tuple(Plot(chart, points) for chart in charts)
+
+
+def number(value: float | None, scale: float = 1.0) -> str:
+    """Four significant digits, a dash for None."""
+    if value is None:
+        return "–"
+    scaled = value * scale
+    return f"{scaled:.0f}" if abs(scaled) >= 1e4 else f"{scaled:.4g}"
+
+
 def render(page: Page) -> str:
     """The page as HTML with everything in it: styles, scripts, figures with plotly.js (once), and pictures."""
     from jinja2 import Environment, StrictUndefined  # imports of a tenth of a second, which only a report needs
@@ -176,6 +193,14 @@ def render(page: Page) -> str:
         plotly=lambda: Markup(get_plotlyjs() if figures else ""),  # 4 MB
         figures=lambda: Markup(_json(figures)),
     )
+
+
+def write_page(page: Page, out: Path) -> Path:
+    """Write a page, its folder too if need be; returns its path. Raises UserError."""
+    page = replace(page, made_with=f"rstrack {version('rolling-shutter-rgbd')}")
+    make_folder(out.parent, out)
+    atomic_write(out, render(page).encode())
+    return out
 
 
 def _json(data: Any) -> str:

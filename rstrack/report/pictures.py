@@ -19,9 +19,9 @@ from rsgen.geometry.spline import Spline
 from rstrack.bench.experiments.pictures import MeshPicture
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import Image, Rig
-from rstrack.metrics.tracked import Tracked
+from rstrack.metrics.run_evaluate import Tracked
 from rstrack.report.page import Block, ImageRow, Note, PageImage, Slider
-from rstrack.view.viewer import jpeg, world_points
+from rstrack.view import jpeg, world_points
 
 # Of maps to be compared with a slider: more than of photographs, for the differences are small.
 _SLIDER_WIDTH = 720

@@ -28,8 +28,7 @@ from rstrack.data.estimate import Estimate, plain, read_estimate
 from rstrack.metrics.association import Truth, compare, truth_of
 from rstrack.metrics.consistency import against_first, covariances, horizon_of, motion_errors, turned
 from rstrack.metrics.evaluate import evaluate
-from rstrack.score.results import About, MethodResults, Result, read_covariances, read_times
-from rstrack.score.suite import Suite, SuiteEntry
+from rstrack.score.suite import About, MethodResults, Result, Suite, SuiteEntry, read_covariances, read_times
 
 FORMAT = "rstrack-scores/1"
 FIGURES = (

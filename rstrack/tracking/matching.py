@@ -20,8 +20,7 @@ from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.judgement.calibration_errors import Common
 from rstrack.tracking.judgement.innovation import Innovation, Prediction, disagreement, learnt, mixture, weighed
 from rstrack.tracking.judgement.lost_track import RunningScales, implausible, is_hopeless, is_settled, lost, misfits
-from rstrack.tracking.judgement.pose_covariances import PoseCovariances
-from rstrack.tracking.judgement.uncertainty import Uncertainty
+from rstrack.tracking.judgement.uncertainty import PoseCovariances, Uncertainty
 from rstrack.tracking.moving.leave_out import LeftOut
 from rstrack.tracking.track import Match, TrackState, gauge_of, is_rolling
 from rstrack.tracking.window import Window

@@ -22,7 +22,7 @@ from rstrack.keyframes.keyframe import Reference
 from rstrack.keyframes.maker import KeyframeMaker
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
-from rstrack.tracking.judgement.pose_covariances import PoseCovariances
+from rstrack.tracking.judgement.uncertainty import PoseCovariances
 from rstrack.tracking.moving.leave_out import without
 from rstrack.tracking.window import Window
 

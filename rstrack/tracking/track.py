@@ -34,7 +34,7 @@ from rstrack.options import Options
 from rstrack.tracking.frame_report import Fault, FrameReport, frame_report
 from rstrack.tracking.judgement.consider import Calibration
 from rstrack.tracking.judgement.lost_track import RunningScales
-from rstrack.tracking.judgement.pose_covariances import PoseCovariances
+from rstrack.tracking.judgement.uncertainty import PoseCovariances
 from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Gains, Succession
 from rstrack.tracking.window import FoundPoses, Window

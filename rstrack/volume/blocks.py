@@ -203,10 +203,6 @@ class FarBlocks:
         self._file: IO[bytes] | None = None
         self._places: dict[int, int] = {}
 
-    def __len__(self) -> int:
-        """Blocks that have been here at some time: their places stay."""
-        return len(self._places)
-
     def __getstate__(self) -> dict[str, Any]:
         """For a checkpoint, which must not change when a block is put again: with the values."""
         blocks = np.array(list(self._places), np.int64)

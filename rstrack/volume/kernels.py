@@ -8,7 +8,7 @@ weights times colours.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import product
 from typing import Any
 
@@ -149,8 +149,8 @@ def integrate(
     dr.eval(*sums)
 
 
-def raycast_kernel(e: Engine, lens: Lens, voxel_m: float, truncation_m: float, colored: bool) -> Callable[..., Any]:
-    """Kernel (T_world_cam (12), box (6), near (m), directory, sums) → (inverse depth, [red, green, blue]).
+def raycast_kernel(e: Engine, lens: Lens, voxel_m: float, truncation_m: float) -> Callable[..., Any]:
+    """Kernel (T_world_cam (12), box (6), near (m), directory, sums) → inverse depth.
 
     Empty blocks are jumped over, seen ones stepped through by what the distance allows; where it changes from in
     front to behind, the zero of the trilinear interpolation is found by secants. 0 where there is none.
@@ -215,10 +215,7 @@ def raycast_kernel(e: Engine, lens: Lens, voxel_m: float, truncation_m: float, c
             f1, good = trilinear(t1, known)
             known &= good
         known &= (dr.abs(f1) * per_t < _HIT) & (dr.abs(t1 - start) * length < 4.0) & (t1 > 0.0)
-        rho = dr.select(known, dr.rcp(dr.select(known, t1, 1.0)), 0.0)
-        if not colored:
-            return rho, []
-        return rho, _color(e, directory, sums, limits, at(t1), known)
+        return dr.select(known, dr.rcp(dr.select(known, t1, 1.0)), 0.0)
 
     return kernel
 
@@ -255,35 +252,17 @@ def _find(e: Engine, directory: Any, cell: list[Any], limits: list[Any]) -> tupl
     return e.UInt(dr.select(there, slot * POINTS + local, 0)), there
 
 
-def _corners(e: Engine, directory: Any, limits: list[Any], p: Vector) -> Iterator[tuple[Any, Any, Any]]:
-    """Of the eight lattice points around lattice coordinates p: trilinear share, index, and whether it is there."""
+def _distance(e: Engine, directory: Any, sums: Any, limits: list[Any], p: Vector, active: Any) -> tuple[Any, Any]:
+    """Trilinear distance at lattice coordinates p, and where all eight lattice points around have been seen."""
     low = [dr.floor(c) for c in p]
     part = [c - f for c, f in zip(p, low, strict=True)]
-    base = [e.Int(f) for f in low]
+    base, out = [e.Int(f) for f in low], e.Float(0.0)
     for high in product((0, 1), repeat=3):
         share = e.Float(1.0)
         for f, up in zip(part, high, strict=True):
             share = share * (f if up else 1.0 - f)
         index, there = _find(e, directory, [b + up for b, up in zip(base, high, strict=True)], limits)
-        yield share, index, there
-
-
-def _distance(e: Engine, directory: Any, sums: Any, limits: list[Any], p: Vector, active: Any) -> tuple[Any, Any]:
-    """Trilinear distance at lattice coordinates p, and where all eight corners have been seen."""
-    out = e.Float(0.0)
-    for share, index, there in _corners(e, directory, limits, p):
         weight = dr.gather(e.Float, sums[1], index, there & active)
         active = active & there & (weight > 0.0)
         out += share * dr.gather(e.Float, sums[0], index, active) / dr.select(active, weight, 1.0)
     return out, active
-
-
-def _color(e: Engine, directory: Any, sums: Any, limits: list[Any], p: Vector, active: Any) -> list[Any]:
-    """Red, green, blue at lattice coordinates p, from those of the eight corners that have a colour."""
-    total, out = e.Float(0.0), [e.Float(0.0)] * 3
-    for share, index, there in _corners(e, directory, limits, p):
-        there &= active
-        total += share * dr.gather(e.Float, sums[5], index, there)
-        out = [o + share * dr.gather(e.Float, s, index, there) for o, s in zip(out, sums[2:5], strict=True)]
-    good = total > 0.0
-    return [dr.select(good, o / dr.select(good, total, 1.0), 0.0) for o in out]

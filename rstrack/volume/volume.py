@@ -6,7 +6,7 @@ bounds: kernels see the blocks about the camera, and those that are far away go 
 
 volume = Volume(engine("auto"), voxel_m=0.01)
 volume.integrate(inverse_depth, T_world_cam, lens)
-inverse_depth, _ = volume.raycast(T_world_cam, lens)
+inverse_depth = volume.raycast(T_world_cam, lens)
 """
 
 from __future__ import annotations
@@ -24,14 +24,7 @@ from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rstrack.volume.blocks import BlockDirectory, BlockValues, unsigned
-from rstrack.volume.kernels import (
-    BLOCK,
-    POINTS,
-    integrate,
-    raycast_kernel,
-    scale_kernel,
-    visible_blocks_kernel,
-)
+from rstrack.volume.kernels import BLOCK, POINTS, integrate, raycast_kernel, scale_kernel, visible_blocks_kernel
 
 # Voxels to both sides of a surface within which distances are stored: at most the eight of a block.
 _TRUNCATION = 4.0
@@ -88,11 +81,6 @@ class Volume:
         return len(self._directory)
 
     @property
-    def blocks_away(self) -> int:
-        """How many of them are in the file only."""
-        return int(np.count_nonzero(self._directory.slots < 0))
-
-    @property
     def bytes(self) -> int:
         """Memory of the values and of the window."""
         return self._values.bytes + 8 * self._directory.table.size
@@ -123,21 +111,17 @@ class Volume:
             [e.upload([r]) for r in T_cam_world[:3, :3].ravel()], self._values.sums,
         )  # fmt: skip
 
-    def raycast(self, T_world_cam: FloatArray, lens: Lens, color: bool = False) -> tuple[Any, list[Any]]:
-        """What a global-shutter pinhole sees: inverse depth (h, w), 1/m, 0 nothing; and red, green, blue on request.
+    def raycast(self, T_world_cam: FloatArray, lens: Lens) -> Any:
+        """What a global-shutter pinhole sees: inverse depth (h, w), 1/m, 0 nothing.
 
         Flat, on the device; as far as the farthest depth that was averaged in. Raises UserError as `integrate` does.
         """
         _check(T_world_cam, lens)
-        e, colored = self.e, color and self._colored
         if not self.blocks or not self._reach(T_world_cam, lens):
-            empty = dr.zeros(e.Float, lens.camera.height * lens.camera.width)
-            return empty, [empty] * (3 if colored else 0)
-        kernel = self._kernel(raycast_kernel, lens, self.voxel_m, self.truncation_m, colored)
+            return dr.zeros(self.e.Float, lens.camera.height * lens.camera.width)
+        kernel = self._kernel(raycast_kernel, lens, self.voxel_m, self.truncation_m)
         pose, box = self._from_nearby(T_world_cam)
-        sums = self._values.sums if colored else self._values.sums[:2]
-        rho, seen = kernel(pose, box, e.upload([_NEAR_M]), self._table, sums)
-        return rho, list(seen)
+        return kernel(pose, box, self.e.upload([_NEAR_M]), self._table, self._values.sums[:2])
 
     def download(self) -> Blocks:
         """The whole volume on the host."""

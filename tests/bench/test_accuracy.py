@@ -11,7 +11,7 @@ from estimates import CAMERA, SHUTTER
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.bench.definitions import CaseEntry
+from rstrack.bench.cells import CaseEntry
 from rstrack.bench.measures.track import accuracy
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.association import truth_of

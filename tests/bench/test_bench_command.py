@@ -37,8 +37,8 @@ import rsgen.figures
 import rstrack.bench.measures.track
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.experiments.method_results import read_results
 from rstrack.bench.experiments.method_tables import method_tables, notes
+from rstrack.bench.experiments.methods import read_results
 from rstrack.bench.experiments.pictures import draw_sequence
 from rstrack.bench.record import read_record
 from rstrack.bench.tables import tables_text

@@ -10,9 +10,8 @@ import pytest
 import yaml
 
 from rsgen.errors import UserError
-from rstrack.bench.cells import Cell, load_benchmark
+from rstrack.bench.cells import CaseEntry, Cell, MethodEntry, SequenceEntry, load_benchmark
 from rstrack.bench.changes import CHANGES
-from rstrack.bench.definitions import CaseEntry, MethodEntry, SequenceEntry
 
 BASE: dict[str, Any] = {
     "sequences": {"demo": {"config": "demo", "group": "all"}, "desk": {"path": "tum/desk"}},

@@ -18,10 +18,10 @@ from rsgen.config.config import load_config
 from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rstrack.bench import paper
-from rstrack.bench.definitions import OTHERS
+from rstrack.bench.cells import OTHERS
 from rstrack.bench.experiments.method_tables import method_tables, notes
 from rstrack.bench.experiments.methods import load_methods
+from rstrack.bench.figures import PAPER_FIGURES
 from rstrack.bench.record import counts, read_record
 from rstrack.bench.tables import tables_text
 from rstrack.data.estimate import Estimate, read_estimate
@@ -230,7 +230,7 @@ def test_quick_needs_its_section(place: Path) -> None:
 
 def test_the_projects_own_config() -> None:
     config = load_methods(ROOT / "configs/evaluation.yaml")
-    assert {(name, method) for name in config.sequences for method in config.methods} == set(paper.FIGURES)
+    assert {(name, method) for name in config.sequences for method in config.methods} == set(PAPER_FIGURES)
     assert all(load_config(config_file(str(s.config))).name == name for name, s in config.sequences.items())
     assert {s.group for s in config.sequences.values()} == {"hand-held", "living room"} and config.quick is not None
     assert [m for m in config.methods if m not in METHODS] == []

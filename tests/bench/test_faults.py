@@ -26,7 +26,7 @@ from rsgen.sequence.trajectory import Trajectory
 from rstrack.bench.cells import Benchmark, load_benchmark
 from rstrack.bench.changes import reordered, with_depth
 from rstrack.bench.runner import run_cells
-from rstrack.bench.sequences import Sources
+from rstrack.bench.task import Sources
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.metrics.association import true_poses
 from rstrack.options import Options

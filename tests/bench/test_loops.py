@@ -14,8 +14,7 @@ from benchmarks.measures.loops import loops_cell
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
-from rstrack.bench.sequences import Absent
-from rstrack.bench.task import Task
+from rstrack.bench.task import Absent, Task
 from rstrack.data.dataset import Dataset
 
 OPTIONS = {"keyframe_distance": 0.04, "bootstrap_frames": 3, "backend": "llvm"}

@@ -20,9 +20,8 @@ import yaml
 from bench_evaluation import made_up_record, main
 
 import rstrack.bench.experiments.pictures as mesh_pictures
-from rstrack.bench.experiments.method_results import Results
 from rstrack.bench.experiments.method_tables import write_results
-from rstrack.bench.experiments.methods import SequenceInfo
+from rstrack.bench.experiments.methods import Results, SequenceInfo
 from rstrack.bench.experiments.pictures import draw_meshes, make_mesh, read_picture
 from rstrack.bench.record import write_record
 from rstrack.bench.runner import Outcome
@@ -234,7 +233,7 @@ def test_the_command(
 ) -> None:
     results, called = of(place), []
     outcome = Outcome({record.cell: record for record in results.records})
-    monkeypatch.setattr("rstrack.bench.experiments.run.run_cells", lambda *_: outcome)
+    monkeypatch.setattr("rstrack.bench.runner.run_cells", lambda *_: outcome)
     monkeypatch.setattr("rstrack.bench.experiments.pictures.draw_plots", lambda *_: [])
 
     def draw(given: Results, out: Path, progress: Any, warn: Any) -> list[Path]:

@@ -19,20 +19,24 @@ import rstrack.bench.measures.track
 from rsgen.config.config import load_config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
-from rstrack.bench.experiments.readout import SweepConfig, installed, load_sweep, narrow, sweep_benchmark
-from rstrack.bench.experiments.readout_results import (
+from rstrack.bench.experiments.readout import (
     ReadoutExperiment,
     Sweep,
+    SweepConfig,
     errors,
     growth,
+    installed,
+    load_sweep,
     log_interval,
+    narrow,
+    sweep_benchmark,
     sweep_charts,
     sweep_tables,
     write_sweep,
 )
 from rstrack.bench.record import CellRecord, read_records
 from rstrack.bench.runner import Outcome, run_cells
-from rstrack.bench.sequences import Sources
+from rstrack.bench.task import Sources
 from rstrack.cli.main import main
 from rstrack.options import Options
 
@@ -152,7 +156,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
             return {"frames": 12, "lost": 12}
         return {"frames": 12, "lost": 0, "ate_mm": 2.0, "drift_mm_s": 3.0, "drift_deg_s": 4.0}
 
-    monkeypatch.setattr("rstrack.bench.sequences.run_rsgen", render)
+    monkeypatch.setattr("rstrack.bench.task.run_rsgen", render)
     monkeypatch.setattr(rstrack.bench.measures.track, "track_cell", track)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     words = ["bench", str(SWEEP), "--sequence", "demo", "--width", "64", "--readout", "0", "0.01", "--exposure", "0"]

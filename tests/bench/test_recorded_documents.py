@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.show import FULL, GATE, README, RESULTS, documents
-from rstrack.bench.machine import versions_behind
-from rstrack.bench.record import CellRecord, read_records
+from rstrack.bench.record import CellRecord, read_records, versions_behind
 from rstrack.bench.runner import OLDEST
 
 ROOT = Path(__file__).parents[2]

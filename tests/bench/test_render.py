@@ -31,7 +31,7 @@ from rsgen.scene.loading import load_scene
 from rstrack.bench.cells import load_benchmark
 from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import run_cells
-from rstrack.bench.sequences import Sources
+from rstrack.bench.task import Sources
 
 MOTION = constant_twist((0.5, 0.2, 0.0, 0.4, 3.0, 2.0))
 STAMP = 0.05

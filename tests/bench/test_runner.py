@@ -13,14 +13,12 @@ import synthetic
 import yaml
 
 from rsgen.errors import UserError
-from rstrack.bench import machine, runner
-from rstrack.bench.cells import Benchmark, Cell
-from rstrack.bench.definitions import CaseEntry, MethodEntry, NoiseEntry, SequenceEntry
-from rstrack.bench.machine import versions_behind
-from rstrack.bench.record import CellRecord, read_record, read_records, write_records
+from rstrack.bench import record as record_module
+from rstrack.bench import runner
+from rstrack.bench.cells import Benchmark, CaseEntry, Cell, MethodEntry, NoiseEntry, SequenceEntry
+from rstrack.bench.record import CellRecord, read_record, read_records, versions_behind, write_records
 from rstrack.bench.runner import Outcome, run_cells
-from rstrack.bench.sequences import Absent, Sources
-from rstrack.bench.task import Task
+from rstrack.bench.task import Absent, Sources, Task
 
 CALLS: list[str] = []
 FAILURES: dict[str, BaseException] = {}
@@ -137,7 +135,7 @@ def test_what_takes_hours_stands_for_three_minor_versions(
 
 
 def test_versions_are_counted_by_their_second_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "package_version", lambda: "0.27.1")
+    monkeypatch.setattr(record_module, "package_version", lambda: "0.27.1")
     assert [versions_behind(v) for v in ("0.27.0", "0.25.3", "0.28.0")] == [0, 2, -1]
     assert versions_behind("1.27.0") > 2
 

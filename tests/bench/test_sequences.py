@@ -15,8 +15,8 @@ import yaml
 from rsgen.config.config import load_config
 from rsgen.console.configs import config_file, scaled
 from rsgen.errors import UserError
-from rstrack.bench.definitions import SequenceEntry
-from rstrack.bench.sequences import Absent, Sources, run_rsgen
+from rstrack.bench.cells import SequenceEntry
+from rstrack.bench.task import Absent, Sources, run_rsgen
 
 
 class Renderer:

@@ -16,7 +16,7 @@ from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rstrack.bench.measures import speed
 from rstrack.bench.measures.speed import Stopwatch, speed_cell
-from rstrack.bench.sequences import Absent
+from rstrack.bench.task import Absent
 
 
 @pytest.fixture(scope="module")

@@ -36,13 +36,13 @@ from rstrack.bench.experiments.stress import (
 )
 from rstrack.bench.experiments.stress_results import draw_stress, write_stress
 from rstrack.bench.measures import blur
+from rstrack.bench.measures.blur import gradient_energy, psnr_db, ssim
 from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import run_cells
-from rstrack.bench.sequences import Sources
+from rstrack.bench.task import Sources
 from rstrack.cli.main import main
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
-from rstrack.metrics.images import gradient_energy, psnr_db, ssim
 
 WIDTH, HEIGHT, FOCAL, FRAMES, SUBTIMES = 96, 72, 150.0, 18, 8
 # Waves per metre: about seven pixels long on the far wall.
@@ -291,7 +291,7 @@ def test_a_failing_render_is_one_line(
 
 
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("rstrack.bench.sequences.run_rsgen", render)
+    monkeypatch.setattr("rstrack.bench.task.run_rsgen", render)
     monkeypatch.setattr(rstrack.bench.measures.track, "track", told_truth)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     config = write_config(tmp_path / "tiny.yaml")

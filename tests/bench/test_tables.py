@@ -13,11 +13,10 @@ from matplotlib.figure import Figure
 
 import rsgen.figures
 from rsgen.console.tables import csv_text
-from rstrack.bench import paper
-from rstrack.bench.experiments.method_results import Results, better_pct, read_results
 from rstrack.bench.experiments.method_tables import csv_rows, method_tables, notes, write_results
-from rstrack.bench.experiments.methods import SequenceInfo
+from rstrack.bench.experiments.methods import Results, SequenceInfo, better_pct, read_results
 from rstrack.bench.experiments.pictures import ate_chart
+from rstrack.bench.figures import PAPER_FIGURES, PAPER_NAMES, paper_average
 from rstrack.bench.record import CellRecord
 from rstrack.bench.tables import tables_markdown, tables_text
 from rstrack.charts.to_file import write_charts
@@ -145,15 +144,15 @@ def test_the_papers_averages_are_those_of_its_rows() -> None:
         "kt": ((0.2301, 17.4030, 0.4165), (0.0249, 0.4127, 0.1218), (0.0102, 0.2958, 0.0495),
                (0.0093, 0.2033, 0.0233), (0.0053, 0.1224, 0.0132)),
     }  # fmt: skip
-    names = dict.fromkeys(sequence for sequence, _ in paper.FIGURES)
+    names = dict.fromkeys(sequence for sequence, _ in PAPER_FIGURES)
     groups = {"hand": [n for n in names if "kt" not in n], "kt": [n for n in names if "kt" in n]}
     for group, rows in published.items():
-        for method, expected in zip(paper.NAMES, rows, strict=True):
-            mean = paper.average(groups[group], method)
+        for method, expected in zip(PAPER_NAMES, rows, strict=True):
+            mean = paper_average(groups[group], method)
             found = (1e-3 * mean["drift_mm_s"], mean["drift_deg_s"], 1e-3 * mean["ate_mm"])
             assert found == pytest.approx(expected, abs=1.01e-4), (group, method)
-    assert paper.average([], "rs-pg") == paper.average(["table1", "mine"], "rs-pg") == {}
-    assert paper.average(["table1"], "gs-p") == {}
+    assert paper_average([], "rs-pg") == paper_average(["table1", "mine"], "rs-pg") == {}
+    assert paper_average(["table1"], "gs-p") == {}
 
 
 @pytest.fixture

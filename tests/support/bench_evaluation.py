@@ -14,11 +14,10 @@ import yaml
 from rsgen.console.command_line import Commands, Parser, run_program
 from rsgen.geometry import se3
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.experiments.method_results import Results
-from rstrack.bench.experiments.methods import Plan, load_methods, make_plan
+from rstrack.bench.experiments.methods import Plan, Results, load_methods, make_plan
 from rstrack.bench.record import CellRecord
 from rstrack.bench.runner import RECORD, Outcome, run_cells
-from rstrack.bench.sequences import Sources
+from rstrack.bench.task import Sources
 from rstrack.cli.benchmark import bench
 
 FRAMES = 31

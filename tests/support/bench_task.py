@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rstrack.bench.cells import Cell
-from rstrack.bench.definitions import CaseEntry, MethodEntry, SequenceEntry
-from rstrack.bench.sequences import Sources
-from rstrack.bench.task import Task
+from rstrack.bench.cells import CaseEntry, Cell, MethodEntry, SequenceEntry
+from rstrack.bench.task import Sources, Task
 
 
 def make_task(

@@ -10,8 +10,8 @@ from rendering import dr, mi
 
 from rsgen.config.config import LightConfig
 from rsgen.device.arrays import rows_of
-from rsgen.light import cache as lighting
-from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
+from rsgen.light import bake as lighting
+from rsgen.render.irradiance import IrradianceField, make_lattice
 from rsgen.scene.loading import load_scene
 from rsgen.scene.rays import rays_from
 
@@ -81,7 +81,7 @@ def floor_grid(extent: float = 0.9, count: int = 25) -> np.ndarray:
 def floor_light(scene: Any, xyz: np.ndarray, **settings: Any) -> np.ndarray:
     """Baked irradiance (n, 3) of the floor at points, looked up from just above."""
     lattice, front, back = bake(scene, **settings)
-    return lookup(scene, make_field(lattice, front, back), xyz + 0.005 * UP, -UP)[1]
+    return lookup(scene, IrradianceField(lattice, front, back), xyz + 0.005 * UP, -UP)[1]
 
 
 CORNELL = [

@@ -22,7 +22,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.light.bake import bake
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
-from rsgen.render.irradiance import make_field, make_lattice
+from rsgen.render.irradiance import IrradianceField, make_lattice
 from rsgen.scene.placement import SceneOptions
 
 WIDTH, HEIGHT, FOCAL = 80, 60, 70.0
@@ -69,7 +69,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 def baked(scene: Any, texel_m: float = 0.2) -> BakedIntegrator:
     light = LightConfig(texel_m=texel_m, direct_samples=256, gather_rays=64, bounces=2)
     lattice = make_lattice(scene, texel_m)
-    return BakedIntegrator(make_field(lattice, *bake(scene, lattice, light, no_progress)))
+    return BakedIntegrator(IrradianceField(lattice, *bake(scene, lattice, light, no_progress)))
 
 
 def picture(seed: int, size: int = 16) -> np.ndarray:

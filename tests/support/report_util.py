@@ -23,9 +23,8 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.experiments.method_results import Results
 from rstrack.bench.experiments.method_tables import write_results
-from rstrack.bench.experiments.methods import SequenceInfo
+from rstrack.bench.experiments.methods import Results, SequenceInfo
 from rstrack.bench.experiments.stress import StressResult
 from rstrack.bench.experiments.stress_results import write_stress
 from rstrack.bench.measures.blur import PANELS, Panels

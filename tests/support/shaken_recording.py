@@ -13,7 +13,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.geometry.spline import Spline
-from rstrack.calibration.figures import Pace, ResidualScales
+from rstrack.calibration.figures import ResidualScales
 from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.image_files import ImageReader
 from rstrack.data.rig import DepthError
@@ -24,7 +24,8 @@ CORNER = se3.exp(np.array([-0.3, -0.1, 0.2, -0.4, 0.65, 0.1]))
 # As few as will do.
 SHORT = slice(0, 42)
 OPTIONS = Options(backend="llvm")
-RESIDUALS, PACE = (ResidualScales(2e-3, 0.02), ResidualScales(1e-3, 0.01)), Pace(*np.ones((3, 2)))
+RESIDUALS = ResidualScales(2e-3, 0.02), ResidualScales(1e-3, 0.01)
+PACE = {name: [1.0, 1.0] for name in ("time_s", "m_s", "rad_s")}
 
 
 def shaking() -> Spline:

@@ -15,6 +15,12 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from rsgen.config.config import Config
+from rsgen.produce.generate import RenderJob
+from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
+from rsgen.produce.writer import SequenceWriter
+from rsgen.sensors.color import Setting
+
 SCENE = """\
 <scene version="3.0.0">
   <bsdf type="twosided" id="paper">
@@ -94,3 +100,12 @@ def digests(folder: Path) -> dict[str, str]:
     """SHA-256 of every file of a sequence by its name, except origin.yaml, which is not part of it."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "origin.yaml"]
     return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def render_job(config: Config, out: Path, *shots: tuple[int, str], **settings: list[Setting]) -> RenderJob:
+    """A worker's job of images (frame, stream) of the config's sequence. settings: of automatic cameras."""
+    motion, identity = load_motion(config), (engine_versions(config.backend), input_hashes(config))
+    writer = SequenceWriter.open(out, config, motion.spline, sequence_stamps(config, motion), *identity)
+    for name, of_camera in settings.items():
+        writer = writer.adapted(name, of_camera)
+    return RenderJob(writer, *identity, shots, key=str(out))

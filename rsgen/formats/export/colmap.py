@@ -14,9 +14,9 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write
+from rsgen.files import write_lines
 from rsgen.formats.export import poses
-from rsgen.formats.export.shared import DEFAULTS, ExportOptions, make_folders, new_folder, place_images
+from rsgen.formats.export.shared import DEFAULTS, ExportOptions, new_folder, part_of, place_images
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.sequence.format import pose_rows
@@ -38,13 +38,11 @@ def export_colmap(
     T_world_color = poses.at_line(sequence, poses.middle_line(sequence))
     observed = poses.observations(sequence)
     losses = {poses.ONE_POSE: poses.loss_of_poses(color.camera, observed, T_world_color[observed.image])}
-    points = poses.surface_points(sequence, progress, (0.0, 0.8))
+    points = poses.surface_points(sequence, part_of(progress, 0.0, 0.8))
     names = [path.name for path in color.paths]
 
-    new_folder(out)
-    model = out / "sparse" / "0"
-    make_folders(out / "images", model)
-    place_images(color.paths, [out / "images" / name for name in names], options.copy, progress, (0.8, 1.0))
+    new_folder(out, "images", "sparse/0")
+    place_images(color.paths, out / "images", options.copy, part_of(progress, 0.8, 1.0))
     poses.write_shutter_files(sequence, out, losses)
     files = {
         "cameras.txt": cameras,
@@ -52,7 +50,7 @@ def export_colmap(
         "points3D.txt": _points(T_world_color, color.camera, points),
     }
     for name, lines in files.items():
-        atomic_write(model / name, "".join(f"{line}\n" for line in lines).encode())
+        write_lines(out / "sparse/0" / name, lines)
     return f"{out}: {len(names)} images, {len(points.p_world)} points; {poses.loss_words(losses)}"
 
 

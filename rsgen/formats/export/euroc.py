@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml
+from rsgen.files import atomic_write, encode_yaml, write_lines
 from rsgen.formats.export.shared import (
     DEFAULTS,
     EPOCH_S,
@@ -32,15 +32,15 @@ from rsgen.formats.export.shared import (
     counted,
     four_coefficients,
     image_streams,
-    make_folders,
     new_folder,
+    part_of,
     place_images,
 )
 from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, nanoseconds, write_imu_csv
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import ground_truth, pose_rows
 from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.truth.settings import sequence_imu
 
 _MODELS = {"pinhole": "radial-tangential", "fisheye": "equidistant"} | dict.fromkeys(
     ("radtan", "rational"), "radial-tangential"
@@ -80,9 +80,10 @@ def export_euroc(
     if min(*(ns[0] for ns in stamps.values()), nanoseconds(times[:1], epoch_s)[0]) < 0:
         raise UserError(f"{out}: EuRoC's stamps cannot be negative: give an epoch of a second or more")
 
-    new_folder(root)
-    make_folders(*(root / name / "data" for name in sensors), root / _TRUTH)
-    atomic_write(root / "body.yaml", encode_yaml(_body_yaml(sequence, imu.config if imu else None, epoch_s)))
+    new_folder(root, *(f"{name}/data" for name in sensors), _TRUTH, *(["imu0"] if imu else []))
+    frame = "the IMU" if imu else "the depth camera" if isinstance(sequence, Sequence) else "that of the rig"
+    body: dict[str, Any] = {"comment": f"rsgen {sequence.name}: the body is {frame}", "epoch_s": epoch_s}
+    atomic_write(root / "body.yaml", encode_yaml(body | ({"gravity": list(imu.config.gravity)} if imu else {})))
     truth = truth_csv(sequence, times, T_depth_body, imu.samples if imu else None, epoch_s)
     atomic_write(root / _TRUTH / "data.csv", truth)
     truth_sensor = {
@@ -92,17 +93,13 @@ def export_euroc(
     }
     atomic_write(root / _TRUTH / "sensor.yaml", encode_yaml(truth_sensor))
     if imu:
-        make_folders(root / "imu0")
         write_imu_csv(root / "imu0" / "data.csv", imu.samples, epoch_s)
         atomic_write(root / "imu0" / "sensor.yaml", encode_yaml(_imu_yaml(imu.config)))
     for k, (name, (stream, _)) in enumerate(sensors.items()):
-        files = [f"{ns}.png" for ns in stamps[name]]
-        rows = [f"{ns},{file}" for ns, file in zip(stamps[name], files, strict=True)]
-        atomic_write(root / name / "data.csv", "\n".join(["#timestamp [ns],filename", *rows, ""]).encode())
+        write_lines(root / name / "data.csv", ["#timestamp [ns],filename", *(f"{ns},{ns}.png" for ns in stamps[name])])
         atomic_write(root / name / "sensor.yaml", encode_yaml(described[name]))
-        targets = [root / name / "data" / file for file in files]
-        part = k / len(sensors), (k + 1) / len(sensors)
-        place_images(stream.paths, targets, options.copy, progress, part)
+        part = part_of(progress, k / len(sensors), (k + 1) / len(sensors))
+        place_images(stream.paths, root / name / "data", options.copy, part, [f"{ns}.png" for ns in stamps[name]])
     return f"{root}: {counted(streams)}, {f'{len(times)} IMU samples' if imu else 'no IMU'}, stamps + {epoch_s} s"
 
 
@@ -170,12 +167,6 @@ def _imu_yaml(imu: ImuConfig) -> dict[str, Any]:
         "accelerometer_noise_density": imu.accelerometer_noise_density,
         "accelerometer_random_walk": imu.accelerometer_random_walk,
     }
-
-
-def _body_yaml(sequence: Rig, imu: ImuConfig | None, epoch_s: int) -> dict[str, Any]:
-    frame = "the IMU" if imu else "the depth camera" if isinstance(sequence, Sequence) else "that of the rig"
-    data: dict[str, Any] = {"comment": f"rsgen {sequence.name}: the body is {frame}", "epoch_s": epoch_s}
-    return data | ({"gravity": list(imu.gravity)} if imu else {})
 
 
 def _matrix(T: FloatArray) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rsgen.array_types import FloatArray
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, encode_yaml
@@ -19,7 +19,6 @@ from rsgen.formats.export.shared import (
     EPOCH_S,
     ExportOptions,
     four_coefficients,
-    make_folders,
     new_folder,
     place_images,
 )
@@ -28,8 +27,8 @@ from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import nanoseconds, write_imu_csv
+from rsgen.sensors.reports import SequenceImu, sequence_imu, sequence_target
 from rsgen.sequence.images import ImageStream, Rig
-from rsgen.truth.settings import SequenceImu, sequence_imu, sequence_target
 
 IMU_TOPIC = "/imu0"
 _MODELS = {"pinhole": "radtan", "radtan": "radtan", "rational": "radtan", "fisheye": "equidistant"}
@@ -60,10 +59,10 @@ def export_kalibr(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, p
         written.append("target.yaml")
         for name, stream in zip(chain, sequence.streams.values(), strict=True):
             if not stream.is_depth:
-                make_folders(out / name)
-                targets = [out / name / f"{ns}.png" for ns in nanoseconds(stream.listed, EPOCH_S)]
-                place_images(stream.paths, targets, options.copy, progress)
-                written.append(f"{name}/ with {len(targets)} images")
+                new_folder(out / name)
+                files = [f"{ns}.png" for ns in nanoseconds(stream.listed, EPOCH_S)]
+                place_images(stream.paths, out / name, options.copy, progress, files)
+                written.append(f"{name}/ with {len(files)} images")
         if imu:
             write_imu_csv(out / "imu0.csv", imu.samples, EPOCH_S)
             written.append("imu0.csv")

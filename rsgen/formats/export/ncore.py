@@ -37,7 +37,7 @@ def export_ncore(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, pr
     or written.
     """
     v4, data = _library()
-    sequence = sequence.as_taken if isinstance(sequence, Sequence) else sequence
+    sequence = sequence.as_taken
     streams = image_streams(sequence)
     models = {name: _model(data, stream) for name, stream in streams.items()}
     frames = {name: frame_times_us(stream) for name, stream in streams.items()}

@@ -28,8 +28,8 @@ from rsgen.formats.export.shared import (
     DEFAULTS,
     ExportOptions,
     aligned_depth,
-    make_folders,
     new_folder,
+    part_of,
     place_images,
 )  # fmt: skip
 from rsgen.geometry import se3
@@ -57,13 +57,12 @@ def export_nerfstudio(
     color = sequence.streams["color"]
     if color.camera.model not in _MODELS:
         raise UserError(f"nerfstudio has no {color.camera.model} lens: render with radtan or fisheye")
-    points = poses.surface_points(sequence, progress, (0.0, 0.5))
+    points = poses.surface_points(sequence, part_of(progress, 0.0, 0.5))
     losses = _losses(sequence)
 
-    new_folder(out)
-    make_folders(out / "images", out / "depth")
-    place_images(color.paths, [out / "images" / path.name for path in color.paths], options.copy, progress, (0.5, 0.6))
-    depths = aligned_depth(sequence, out / "depth", options.copy, progress, (0.6, 1.0))
+    new_folder(out, "images", "depth")
+    place_images(color.paths, out / "images", options.copy, part_of(progress, 0.5, 0.6))
+    depths = aligned_depth(sequence, out / "depth", options.copy, part_of(progress, 0.6, 1.0))
     poses.write_shutter_files(sequence, out, losses)
     atomic_write(out / "points3D.ply", _ply(points))
     atomic_write(out / "transforms.json", json.dumps(_transforms(sequence, depths), indent=1).encode())

@@ -16,6 +16,7 @@ import numpy as np
 from rsgen.array_types import ByteArray, FloatArray, IntArray
 from rsgen.console.progress import Progress
 from rsgen.files import atomic_write
+from rsgen.formats.export.shared import nearest_depth
 from rsgen.geometry import se3, so3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter, project_rolling
@@ -117,8 +118,7 @@ def observations(sequence: Sequence) -> Observations:
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     found = []
     for k in images:
-        nearest = int(np.abs(depth.stamps - color.stamps[k]).argmin())
-        p_world, _ = exact_points(sequence, nearest, grid)
+        p_world, _ = exact_points(sequence, nearest_depth(sequence, int(k)), grid)
         stamp = blur_centres(color)[k]
         uv, t, valid = project_rolling(
             sequence.spline, sequence.T_color_depth, color.camera, color.shutter, stamp, p_world
@@ -250,20 +250,18 @@ class SurfacePoints:
     uv: tuple[FloatArray, ...]
 
 
-def surface_points(sequence: Sequence, progress: Progress, share: tuple[float, float]) -> SurfacePoints:
+def surface_points(sequence: Sequence, progress: Progress) -> SurfacePoints:
     """Points from the exact depth of some depth images, each in one colour image or more. Raises UserError.
 
     A point is visible if the depth image that is nearest in time shows it at its depth. Its colour is that of the first
-    image that shows it. sequence: with the cameras that took it. share: of the whole export's progress.
+    image that shows it. sequence: with the cameras that took it.
     """
     color = sequence.streams["color"]
     p_world = _seeds(sequence)
     shown, uvs = [], []
     colors, colored = np.zeros((len(p_world), 3), np.uint8), np.zeros(len(p_world), bool)
     for k, stamp in enumerate(blur_centres(color)):
-        near = _visible_in_depth(
-            sequence, int(np.abs(sequence.streams["depth"].stamps - color.stamps[k]).argmin()), p_world
-        )
+        near = _visible_in_depth(sequence, nearest_depth(sequence, k), p_world)
         uv, _, valid = project_rolling(
             sequence.spline, sequence.T_color_depth, color.camera, color.shutter, stamp, p_world[near]
         )
@@ -277,7 +275,7 @@ def surface_points(sequence: Sequence, progress: Progress, share: tuple[float, f
                 np.clip(v, 0, color.camera.height - 1), np.clip(u, 0, color.camera.width - 1)
             ]
             colored[which] = True
-        progress("export", share[0] + (share[1] - share[0]) * (k + 1) / len(color.paths), color.paths[k].name)
+        progress("export", (k + 1) / len(color.paths), color.paths[k].name)
     number = np.cumsum(colored) - 1
     return SurfacePoints(p_world[colored], colors[colored], tuple(number[which] for which in shown), tuple(uvs))
 

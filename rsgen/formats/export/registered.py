@@ -9,19 +9,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from rsgen.console.progress import Progress, no_progress
-from rsgen.files import atomic_write, encode_yaml
+from rsgen.files import atomic_write, encode_yaml, write_lines
 from rsgen.formats.export.shared import (
     DEFAULTS,
     ExportOptions,
     color_truth,
-    make_folders,
+    depth_warper,
     new_folder,
+    part_of,
     place_images,
     registered_cameras,
 )
-from rsgen.image_codecs import encode_png
-from rsgen.produce.writer import quantise
-from rsgen.sensors.depth import register_depth
 from rsgen.sequence.format import associate, pose_lines
 from rsgen.sequence.images import Sequence
 
@@ -42,36 +40,24 @@ def export_registered(
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     sequence.depth(0)  # checks its size, before memory is taken for that of sequence.yaml
-    new_folder(out)
-    make_folders(out / "rgb", out / "depth")
-    place_images(color.paths, [out / "rgb" / path.name for path in color.paths], options.copy, progress, (0.0, 0.1))
-    rays = depth.camera.unproject(depth.camera.pixel_grid())
-    filled = 0.0
+    new_folder(out, "rgb", "depth")
+    place_images(color.paths, out / "rgb", options.copy, part_of(progress, 0.0, 0.1))
+    filled, image = 0.0, sequence.depth if depth.registered else depth_warper(sequence, out / "depth")
     if depth.registered:
-        place_images(
-            depth.paths, [out / "depth" / path.name for path in depth.paths], options.copy, progress, (0.1, 0.2)
-        )
+        place_images(depth.paths, out / "depth", options.copy, part_of(progress, 0.1, 0.2))
     for k, path in enumerate(depth.paths):
-        z = sequence.depth(k)
-        if not depth.registered:
-            z = register_depth(rays, z, color.camera, sequence.T_color_depth)
-            atomic_write(out / "depth" / path.name, encode_png(quantise(z, depth.depth_scale)))
-        filled += float((z > 0).mean()) / len(depth.paths)
+        filled += float((image(k) > 0).mean()) / len(depth.paths)
         progress("export", 0.2 + 0.8 * (k + 1) / len(depth.paths), path.name)
 
     entries = {
         folder: [f"{t:.9f} {folder}/{path.name}" for t, path in zip(stream.listed, stream.paths, strict=True)]
         for folder, stream in (("rgb", color), ("depth", depth))
     }
-    _write(out / "rgb.txt", [f"# colour images of {sequence.name}", "# stamp path", *entries["rgb"]])
-    _write(out / "depth.txt", [f"# depth images of {sequence.name}, {_MARK}", "# stamp path", *entries["depth"]])
+    write_lines(out / "rgb.txt", [f"# colour images of {sequence.name}", "# stamp path", *entries["rgb"]])
+    write_lines(out / "depth.txt", [f"# depth images of {sequence.name}, {_MARK}", "# stamp path", *entries["depth"]])
     pairs = associate(color.listed, depth.listed, 0.5 / min(color.rate_hz, depth.rate_hz))
-    _write(out / "associations.txt", [f"{entries['rgb'][i]} {entries['depth'][j]}" for i, j in pairs])
+    write_lines(out / "associations.txt", [f"{entries['rgb'][i]} {entries['depth'][j]}" for i, j in pairs])
     rows, reported = color_truth(sequence)
-    _write(out / "groundtruth.txt", pose_lines(f"ground truth of {sequence.name}: T_world_color{reported}", rows))
+    write_lines(out / "groundtruth.txt", pose_lines(f"ground truth of {sequence.name}: T_world_color{reported}", rows))
     atomic_write(out / "camera.yaml", f"# depth is {_MARK}\n".encode() + encode_yaml(registered_cameras(sequence)))
     return f"{out}: {len(depth.paths)} depth images {_MARK}; {100 * filled:.0f} % of pixels have depth"
-
-
-def _write(path: Path, lines: list[str]) -> None:
-    atomic_write(path, "".join(f"{line}\n" for line in lines).encode())

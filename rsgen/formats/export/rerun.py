@@ -11,16 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.console.rerun import recording_file
 from rsgen.errors import UserError
 from rsgen.files import read_bytes
 from rsgen.formats.export.shared import DEFAULTS, ExportOptions, image_streams
 from rsgen.geometry import se3
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import ground_truth
-from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.truth.settings import sequence_imu
+from rsgen.sequence.images import Rig
 
 TIMELINE = "time"
 _UP = {(0, 1): "X_DOWN", (0, -1): "X_UP", (1, 1): "Y_DOWN", (1, -1): "Y_UP", (2, 1): "Z_DOWN", (2, -1): "Z_UP"}
@@ -35,7 +34,7 @@ def export_rerun(sequence: Rig, out: Path, options: ExportOptions = DEFAULTS, pr
     """
     out = Path(out)
     with recording_file(out, "rsgen", sequence.name, "--out") as (rr, recording):
-        _log(rr, recording, sequence.as_taken if isinstance(sequence, Sequence) else sequence, progress)
+        _log(rr, recording, sequence.as_taken, progress)
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB, open it with 'rerun {out.name}'"
 
 
@@ -66,7 +65,8 @@ def _log(rr: Any, recording: Any, sequence: Rig, progress: Progress) -> None:
             image_plane_distance=0.2,
         )
         recording.log(where, pinhole, static=True)
-        poses = _middle_poses(sequence, stream)
+        middle = stream.shutter.line_mid_time(stream.stamps, 0.5 * (stream.line_count - 1), camera)
+        poses = np.asarray(sequence.spline.pose(middle) @ se3.inverse(stream.T_cam_body))
         for k, file in enumerate(stream.paths):
             recording.set_time(TIMELINE, duration=float(stream.stamps[k]))
             recording.log(where, rr.Transform3D(translation=poses[k, :3, 3], mat3x3=poses[k, :3, :3]))
@@ -78,13 +78,6 @@ def _log(rr: Any, recording: Any, sequence: Rig, progress: Progress) -> None:
             recording.log(f"{where}/image", picture)
             done += 1
             progress("export", done / count, file.name)
-
-
-def _middle_poses(sequence: Rig, stream: ImageStream) -> FloatArray:
-    """T_world_cam (n, 4, 4) of the frames in the middle of their readout."""
-    middle = 0.5 * (stream.line_count - 1)
-    times = stream.shutter.line_mid_time(stream.stamps, middle, stream.camera)
-    return np.asarray(sequence.spline.pose(times) @ se3.inverse(stream.T_cam_body))
 
 
 def _log_scene(rr: Any, recording: Any, path: Path) -> None:

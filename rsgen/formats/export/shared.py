@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsgen.array_types import FloatArray
+from rsgen.array_types import Float32Array, FloatArray
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rsgen.files import atomic_write, read_bytes, write_error
@@ -20,11 +20,10 @@ from rsgen.geometry.camera import Camera
 from rsgen.image_codecs import encode_png
 from rsgen.produce.writer import quantise
 from rsgen.sensors.depth import register_depth
-from rsgen.sensors.reports import reported_poses
+from rsgen.sensors.reports import reported_poses, sequence_mocap
 from rsgen.sequence.camera_yaml import Cameras, ColorClock, camera_yaml
 from rsgen.sequence.format import ground_truth
 from rsgen.sequence.images import ImageStream, Rig, Sequence
-from rsgen.truth.settings import sequence_mocap
 
 Storage = Literal["sqlite3", "mcap"]
 EPOCH_S = 1_000_000_000
@@ -67,40 +66,37 @@ def new_file(out: Path, what: str, suffixes: Items[str]) -> Path:
     return out
 
 
-def new_folder(out: Path) -> Path:
-    """Make the folder `out`. Raises UserError if it cannot be made, or is there and holds anything."""
-    out = Path(out)
+def new_folder(out: Path, *inside: str) -> None:
+    """Make the folder `out`, and those inside. Raises UserError if one cannot be made, or `out` holds anything."""
+    folder = out
     try:
         if out.exists() and not out.is_dir():
             raise UserError(f"{out}: is a file, not a folder: choose another --out")
         if out.is_dir() and (names := sorted(path.name for path in out.iterdir())):
             raise UserError(f"{out}: is not empty ({names[0]}, ...): choose another --out or delete it")
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(out, error) from None
-    return out
-
-
-def make_folders(*folders: Path) -> None:
-    """Make folders with their parents. Raises UserError."""
-    for folder in folders:
-        try:
+        for folder in (out, *(out / name for name in inside)):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise write_error(folder, error) from None
+    except OSError as error:
+        raise write_error(folder, error) from None
+
+
+def part_of(progress: Progress, begin: float, end: float) -> Progress:
+    """The progress of what is `begin` to `end` of the whole export."""
+    return lambda stage, fraction, note: progress(stage, begin + (end - begin) * fraction, note)
 
 
 def place_images(
-    sources: Items[Path], targets: Items[Path], copy: bool, progress: Progress, share: tuple[float, float] = (0.0, 1.0)
+    sources: Items[Path], folder: Path, copy: bool, progress: Progress, names: Items[str] | None = None
 ) -> None:
-    """Hard links from `targets` to `sources`, which take no room; copies where links cannot be, or on request.
+    """Hard links in `folder` to `sources`, which take no room; copies where links cannot be, or on request.
 
-    share: where in the whole export's progress this begins and ends. Raises UserError naming the file.
+    names: of the links, where they are not the files' own. Raises UserError naming the file.
     """
-    for k, (source, target) in enumerate(zip(sources, targets, strict=True)):
+    targets = [folder / name for name in names or [source.name for source in sources]]
+    for k, (source, target) in enumerate(zip(sources, targets, strict=True), 1):
         if copy or not _linked(source, target):
             atomic_write(target, read_bytes(source))
-        progress("export", share[0] + (share[1] - share[0]) * (k + 1) / len(sources), target.name)
+        progress("export", k / len(sources), target.name)
 
 
 def _linked(source: Path, target: Path) -> bool:
@@ -149,29 +145,44 @@ def four_coefficients(name: str, camera: Camera) -> list[float]:
     return list(camera.distortion[:4])
 
 
-def aligned_depth(
-    sequence: Sequence, folder: Path, copy: bool, progress: Progress, share: tuple[float, float]
-) -> list[str]:
+def nearest_depth(sequence: Sequence, k: int) -> int:
+    """The depth image that is nearest in time to colour image k."""
+    return int(np.abs(sequence.streams["depth"].stamps - sequence.streams["color"].stamps[k]).argmin())
+
+
+def depth_warper(sequence: Sequence, folder: Path) -> Callable[[int], Float32Array]:
+    """What writes depth image k into `folder`, warped into the colour camera, and returns it, planar z (h, w), m."""
+    color, depth = sequence.streams["color"], sequence.streams["depth"]
+    rays = depth.camera.unproject(depth.camera.pixel_grid())
+
+    def write(k: int) -> Float32Array:
+        z = register_depth(rays, sequence.depth(k), color.camera, sequence.T_color_depth)
+        atomic_write(folder / depth.paths[k].name, encode_png(quantise(z, depth.depth_scale)))
+        return z
+
+    return write
+
+
+def aligned_depth(sequence: Sequence, folder: Path, copy: bool, progress: Progress) -> list[str]:
     """Write depth images into `folder`, 16-bit in the sequence's units; returns the file name for each colour image.
 
     Of each colour image the depth image that is nearest in time, within half a period of the slower stream. Links (or
     copies with `copy`) where depth has the colour camera's pixels: registered, or one camera for both; else warped by
-    geometry alone, as `export registered` does. share: of the whole export's progress. Raises UserError.
+    geometry alone, as `export registered` does. Raises UserError.
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
-    nearest = np.abs(depth.stamps - color.stamps[:, None]).argmin(axis=1)
+    nearest = np.array([nearest_depth(sequence, k) for k in range(len(color.paths))])
     apart = np.abs(depth.stamps[nearest] - color.stamps)
     paired = apart <= 0.5 / min(color.rate_hz, depth.rate_hz)
     used = np.unique(nearest[paired])
     sources = [depth.paths[i] for i in used]
     if has_color_pixels(sequence):
-        place_images(sources, [folder / path.name for path in sources], copy, progress, share)
+        place_images(sources, folder, copy, progress)
     else:
-        rays = depth.camera.unproject(depth.camera.pixel_grid())
+        write = depth_warper(sequence, folder)
         for count, i in enumerate(used, 1):
-            z = register_depth(rays, sequence.depth(int(i)), color.camera, sequence.T_color_depth)
-            atomic_write(folder / depth.paths[i].name, encode_png(quantise(z, depth.depth_scale)))
-            progress("export", share[0] + (share[1] - share[0]) * count / len(used), depth.paths[i].name)
+            write(int(i))
+            progress("export", count / len(used), depth.paths[i].name)
     if not paired.all():
         atomic_write(folder / NO_DEPTH, encode_png(np.zeros((color.camera.height, color.camera.width), np.uint16)))
     return [depth.paths[i].name if found else NO_DEPTH for i, found in zip(nearest, paired, strict=True)]
@@ -180,10 +191,9 @@ def aligned_depth(
 def registered_cameras(sequence: Sequence) -> dict[str, Any]:
     """A camera.yaml of depth that was warped into the colour camera: from where, and whose rows' times it has."""
     color, depth = sequence.streams["color"], sequence.streams["depth"]
-    sensors = color.camera, color.shutter, depth.camera, depth.shutter
     driver = any((stream.listed != stream.stamps).any() for stream in (color, depth))
     clock = ColorClock("auto", is_exact=False) if driver else ColorClock()
-    return camera_yaml(Cameras(*sensors, depth.depth_scale, sequence.T_color_depth), clock, is_registered=True)
+    return camera_yaml(Cameras.of(color, depth, sequence.T_color_depth), clock, is_registered=True)
 
 
 def color_truth(sequence: Sequence) -> tuple[FloatArray, str]:

@@ -18,14 +18,14 @@ import numpy as np
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, encode_yaml
+from rsgen.files import atomic_write, encode_yaml, write_lines
 from rsgen.formats.export.shared import (
     DEFAULTS,
     ExportOptions,
     aligned_depth,
     color_truth,
-    make_folders,
     new_folder,
+    part_of,
     place_images,
     registered_cameras,
 )
@@ -47,23 +47,22 @@ def export_vslamlab(
     """
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     calibration = _calibration(color.camera, color.rate_hz, depth.depth_scale)
-    new_folder(out)
-    make_folders(out / "rgb_0", out / "depth_0")
-    place_images(color.paths, [out / "rgb_0" / path.name for path in color.paths], options.copy, progress, (0.0, 0.3))
-    near = aligned_depth(sequence, out / "depth_0", options.copy, progress, (0.3, 1.0))
+    new_folder(out, "rgb_0", "depth_0")
+    place_images(color.paths, out / "rgb_0", options.copy, part_of(progress, 0.0, 0.3))
+    near = aligned_depth(sequence, out / "depth_0", options.copy, part_of(progress, 0.3, 1.0))
     stamps = dict(zip((path.name for path in depth.paths), nanoseconds(depth.listed), strict=True))
     lines = [
         f"{ns},rgb_0/{path.name},{stamps.get(name, ns)},depth_0/{name}"
         for ns, path, name in zip(nanoseconds(color.listed), color.paths, near, strict=True)
     ]
-    atomic_write(out / "rgb.csv", "\n".join([_RGB_HEADER, *lines, ""]).encode())
+    write_lines(out / "rgb.csv", [_RGB_HEADER, *lines])
     atomic_write(out / "calibration.yaml", b"%YAML 1.2\n---\n" + encode_yaml({"cameras": [calibration]}))
     poses, _ = color_truth(sequence)
     lines = [
         f"{ns}," + ",".join(f"{value:.12f}" for value in row)
         for ns, row in zip(nanoseconds(poses[:, 0]), poses[:, 1:], strict=True)
     ]
-    atomic_write(out / "groundtruth.csv", "\n".join([_TRUTH_HEADER, *lines, ""]).encode())
+    write_lines(out / "groundtruth.csv", [_TRUTH_HEADER, *lines])
     atomic_write(out / "camera.yaml", encode_yaml(registered_cameras(sequence)))
     return f"{out}: {len(color.paths)} colour images with depth, {len(poses)} poses"
 

@@ -23,7 +23,7 @@ from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes import gltf
 from rsgen.formats.meshes.default_light import light_shapes
-from rsgen.formats.meshes.parts import Part, finished, placed
+from rsgen.formats.meshes.parts import WHITE, Part, finished, placed, v_down, without_textures
 from rsgen.image_codecs import encode_png
 from rsgen.inputs import check_input
 from rsgen.scene.material import Material, Texture, bsdf, emitter
@@ -36,7 +36,6 @@ log = logging.getLogger("rsgen")
 # Raise when files are read in another way, so that light baked for the older one is not taken for the new one's.
 _READING = 1
 _GREY = Material()
-_WHITE = Material(color=np.ones(3))
 _GREY_PICTURE = encode_png(np.full((1, 1, 3), 188, np.uint8))  # half of the light, in place of one that is missing
 _BLENDED = 0.5  # cover from which a blended surface counts as there
 _RENDERED = {"KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_materials_pbrSpecularGlossiness"}
@@ -189,14 +188,13 @@ class PartReader:
         part, visual = Part(vertices, faces, _GREY, given_normals(mesh)), mesh.visual
         if not isinstance(visual, trimesh.visual.TextureVisuals):
             if visual.kind == "vertex":
-                return replace(part, material=_WHITE, vertex_colors=from_srgb(visual.vertex_colors))
+                return replace(part, material=WHITE, vertex_colors=from_srgb(visual.vertex_colors))
             if visual.kind == "face":
-                return replace(part, material=_WHITE, face_colors=from_srgb(visual.face_colors))
+                return replace(part, material=WHITE, face_colors=from_srgb(visual.face_colors))
             return part
         if visual.uv is not None and len(visual.uv) == len(vertices):
-            # trimesh's v runs up. Mitsuba's runs down, as glTF's does.
-            uv = np.nan_to_num(np.array(visual.uv, float)[:, :2] * [1, -1] + [0, 1])
-            part = replace(part, uv=np.clip(uv, -1e5, 1e5))
+            # trimesh's v runs up, also of glTF, whose own runs down.
+            part = replace(part, uv=v_down(np.array(visual.uv, float)[:, :2]))
         part = replace(part, material=self._material(visual.material, part.uv is not None))
         return self._with_factors(part, visual.vertex_attributes.get("color"), name)
 
@@ -208,7 +206,7 @@ class PartReader:
         if not np.isfinite(values).all():
             raise UserError(f"scene {self._path}: '{name}' has colours that are not finite: export it again")
         # A primitive without a material is grey only where it has no colours either.
-        material = _WHITE if part.material is _GREY else part.material
+        material = WHITE if part.material is _GREY else part.material
         if material.color_texture is not None:
             if np.ptp(values, axis=0).any():
                 log.warning("scene %s: vertex colours of '%s' left out: it has a texture", self._path, name)
@@ -222,12 +220,7 @@ class PartReader:
         if key not in self._made:
             simple = isinstance(material, trimesh.visual.material.SimpleMaterial)
             made = self._simple(material) if simple else self._pbr(material)
-            if not with_uv and made is not _GREY:
-                none: dict[str, Any] = dict.fromkeys(
-                    f"{name}_texture" for name in ("color", "metal", "normal", "emission")
-                )
-                made = replace(made, **none)
-            self._made[key] = material, made
+            self._made[key] = material, made if with_uv else without_textures(made)
         return self._made[key][1]
 
     def _simple(self, material: Any) -> Material:

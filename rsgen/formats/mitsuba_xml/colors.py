@@ -14,11 +14,6 @@ _COLORS = (
 )
 
 
-def snake(name: str) -> str:
-    """'intIOR' -> 'int_ior', as Mitsuba's own upgrade has it."""
-    return re.sub(r"(?<=[a-z])([A-Z]+)", lambda found: "_" + found[1].lower(), name)
-
-
 def named(e: Element, name: str) -> Element | None:
     """The child of that name, if there is one."""
     return next((child for child in e if child.get("name") == name), None)
@@ -73,13 +68,6 @@ def color_of(e: Element) -> Element:
     """The colour or texture that an object shows; grey where it names none."""
     found = next((child for name in _COLORS if (child := named(e, name)) is not None), None)
     return Element("rgb", value="0.5") if found is None else found
-
-
-def texture_of(rgb: Element) -> Element:
-    """A colour as a texture, for where Mitsuba 3 takes nothing else."""
-    texture = Element("texture", type="srgb")
-    SubElement(texture, "rgb", name="color", value=rgb.get("value", ""))
-    return texture
 
 
 def as_rgb(e: Element) -> Element:

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from rsgen.array_types import FloatArray, IntArray
 from rsgen.errors import first_few
 from rsgen.formats.meshes.mesh_file import from_srgb, given_normals
-from rsgen.formats.polygons import is_convex, triangulated
+from rsgen.formats.meshes.parts import is_convex, triangulated
 from rsgen.scene.meshes import joined_triangles, ply_bytes
+from rsgen.scene.placement import as_ply
 
 _OBJ_METHOD = b"obj-polygons/2"
 """Raise when files come out differently: light baked on their surfaces is stored under it."""
@@ -103,7 +104,10 @@ def read_refused(mi: Any, state: Any, path: Path, scratch: Path) -> bool:
         plugin = node.props.plugin_name()
         mesh = None if _takes(mi, plugin, file) else _read(file, plugin)
         if mesh is not None:
-            node.props = _as_ply(mi, node.props, _stored(mesh, scratch, f"read{number}.ply"))
+            flipped = node.props.get("flip_tex_coords", True)
+            node.props = as_ply(mi, node.props, Path(_stored(mesh, scratch, f"read{number}.ply")))
+            if plugin == "obj":  # whose v runs the other way by default
+                node.props["flip_tex_coords"] = flipped
             names.append(name)
     if names:
         log.info("scene %s: read by trimesh, Mitsuba does not: %s", path, first_few(names))
@@ -121,18 +125,6 @@ def _takes(mi: Any, plugin: str, file: Path) -> bool:
     except Exception:  # of whatever kind Mitsuba's loaders raise
         return False
     return True
-
-
-def _as_ply(mi: Any, props: Any, file: str) -> Any:
-    """The properties of a shape, with its mesh in another file."""
-    out = mi.Properties("ply")
-    out.set_id(props.id())
-    for key in props.keys():  # noqa: SIM118 (Mitsuba's Properties is no dict)
-        out[key] = props[key]
-    out["filename"] = file
-    if props.plugin_name() == "obj":  # whose v runs the other way by default
-        out["flip_tex_coords"] = props.get("flip_tex_coords", True)
-    return out
 
 
 def _read(file: Path, plugin: str) -> bytes | None:

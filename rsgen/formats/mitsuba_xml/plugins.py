@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from xml.etree.ElementTree import Element, SubElement
 
@@ -63,7 +64,8 @@ class Upgrade:
                 parent.remove(child)
                 continue
             if "name" in child.attrib:
-                child.set("name", old.snake(child.attrib["name"]))
+                name = child.attrib["name"]  # 'intIOR' -> 'int_ior', as Mitsuba's own upgrade has it
+                child.set("name", re.sub(r"(?<=[a-z])([A-Z]+)", lambda found: "_" + found[1].lower(), name))
             if child.tag in _OBJECTS:
                 child.set("type", _RENAMED.get(child.get("type", ""), child.get("type", "")))
             for key in [key for key in child.attrib if key not in _ATTRIBUTES and child.tag != "blackbody"]:
@@ -128,7 +130,8 @@ class Upgrade:
                 self._alias[name] = own
                 return new
             if new.tag == "rgb":  # a value has no id: a texture of one colour has
-                new = old.renamed(old.texture_of(new), gone.get("name"))
+                color, new = new, old.renamed(Element("texture", type="srgb"), gone.get("name"))
+                SubElement(new, "rgb", name="color", value=color.get("value", ""))
             new.set("id", name)
         return new
 

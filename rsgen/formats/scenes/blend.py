@@ -17,7 +17,7 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes.mesh_file import read_parts
-from rsgen.formats.scenes.content import Content, Lamp, check_installed
+from rsgen.formats.scenes.import_scene import Content, Lamp, check_installed
 from rsgen.scene.placement import SceneOptions, world_from_file
 
 _LONGEST_S = 1800

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import FloatArray
-from rsgen.formats.scenes.content import Kind, Lamp, Notes
+from rsgen.formats.scenes.import_scene import Kind, Lamp, Notes
 from rsgen.formats.scenes.usd_texture import asset_bytes
 
 LIGHTS = ("SphereLight", "RectLight", "DiskLight", "DistantLight", "DomeLight", "DomeLight_1")

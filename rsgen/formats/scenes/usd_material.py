@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rsgen.array_types import Float32Array, FloatArray
-from rsgen.formats.scenes.content import Notes
+from rsgen.formats.scenes.import_scene import Notes
 from rsgen.formats.scenes.usd_texture import (
     UsdImage,
     asset_bytes,

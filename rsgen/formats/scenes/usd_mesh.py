@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import trimesh
 
 from rsgen.array_types import BoolArray, FloatArray, IntArray
-from rsgen.formats.meshes.parts import Part
-from rsgen.formats.polygons import triangulate
-from rsgen.formats.scenes.content import Notes
+from rsgen.formats.meshes.parts import WHITE, Part, triangulate, v_down, without_textures
+from rsgen.formats.scenes.import_scene import Notes
 from rsgen.formats.scenes.usd_material import BoundMaterial
-from rsgen.scene.material import Material
 
 SOLIDS = ("Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane")
 
@@ -23,7 +21,6 @@ Primvar = Callable[[str], tuple[FloatArray, str] | None]
 
 _CREASE = np.cos(np.radians(50))  # an edge whose corner leans less from its vertex is a smooth one
 _SECTIONS = 48
-_WHITE = Material(color=np.ones(3))
 # Rotations that take z to the axis; a plane's width and length have axes of their own.
 _AXES = {"X": [[0, 0, 1], [1, 0, 0], [0, 1, 0]], "Y": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "Z": np.eye(3).tolist()}
 _PLANE_AXES = _AXES | {"X": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], "Y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
@@ -141,18 +138,16 @@ def parts(
         columns["normals"] = normals[chosen]
     uv = _corners(surface, primvar, bound.coordinates, 2, notes, name) if bound.coordinates else None
     if uv is not None:
-        columns["uv"] = np.clip(np.nan_to_num(uv[chosen] * [1, -1] + [0, 1]), -1e5, 1e5)  # USD's v runs up
+        columns["uv"] = v_down(uv[chosen])
     colors = _corners(surface, primvar, bound.colors, 3, notes, name) if bound.colors else None
     if colors is not None:
         columns["vertex_colors"] = np.clip(np.nan_to_num(colors[chosen]), 0, 1)
     material = bound.material
     if colors is not None and not bound.bound:
-        material = _WHITE
-    textures = [f"{k}_texture" for k in ("color", "metal", "normal", "emission")]
-    if uv is None and any(getattr(material, texture) is not None for texture in textures):
+        material = WHITE
+    if uv is None and (plain := without_textures(material)) is not material:
         notes.add(f"rendered without its textures, it has no coordinates '{bound.coordinates}'", name)
-        none: dict[str, Any] = dict.fromkeys(textures)
-        material = replace(material, **none)
+        material = plain
     corners = surface.corners[chosen]
     rows = np.concatenate(
         [surface.points[surface.vertex[corners]], *columns.values()], axis=-1

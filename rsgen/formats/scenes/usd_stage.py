@@ -15,7 +15,7 @@ from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.formats.meshes.parts import Part, placed
 from rsgen.formats.scenes import usd_light
-from rsgen.formats.scenes.content import MOST_TRIANGLES, Content, Lamp, Notes, check_installed
+from rsgen.formats.scenes.import_scene import MOST_TRIANGLES, Content, Lamp, Notes, check_installed
 from rsgen.formats.scenes.usd_material import UNBOUND, Materials
 from rsgen.formats.scenes.usd_mesh import SOLIDS, Primvar, mesh_triangles, parts, smooth_normals, solid
 from rsgen.inputs import check_input

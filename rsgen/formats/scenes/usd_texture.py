@@ -13,11 +13,10 @@ from PIL import Image
 
 from rsgen import srgb
 from rsgen.array_types import ByteArray, Float32Array, FloatArray
-from rsgen.inputs import MOST_BYTES, MOST_PIXELS, image_size
+from rsgen.inputs import EXR_START, MOST_BYTES, MOST_PIXELS, image_size
 
 _WRAP = {"clamp": "clamp", "black": "clamp", "mirror": "mirror"}
 _FIRST_TILE = "1001"
-_EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ def decoded(data: bytes, space: str) -> Float32Array | None:
     width, height = image_size(data) or (0, 0)
     if width * height > MOST_PIXELS:
         return None
-    if data.startswith(_EXR_MAGIC):
+    if data.startswith(EXR_START):
         return _exr(data)
     try:
         with Image.open(io.BytesIO(data)) as image:

@@ -10,15 +10,21 @@ from typing import Any
 from rsgen.console.progress import Progress
 from rsgen.console.tables import NOTHING, Entry, Table, significant
 from rsgen.files import atomic_write
-from rstrack.bench import paper
 from rstrack.bench.cells import Benchmark
-from rstrack.bench.experiments.method_results import AVERAGE, BASELINE, RESULTS, Results, better_pct
-from rstrack.bench.experiments.methods import Plan, SequenceInfo, fuses, row_of
-from rstrack.bench.experiments.run import Written
-from rstrack.bench.figures import heading
+from rstrack.bench.experiments.methods import (
+    AVERAGE,
+    BASELINE,
+    RESULTS,
+    Plan,
+    Results,
+    SequenceInfo,
+    better_pct,
+    fuses,
+    row_of,
+)
+from rstrack.bench.figures import PAPER_FIGURES, PAPER_NAMES, heading
 from rstrack.bench.record import CellRecord, counts, figure, write_records
-from rstrack.bench.runner import Outcome
-from rstrack.bench.sequences import Sources
+from rstrack.bench.runner import Outcome, Written
 from rstrack.bench.tables import (
     ERRORS,
     cell_text,
@@ -29,6 +35,7 @@ from rstrack.bench.tables import (
     tables_text,
     write_tables,
 )
+from rstrack.bench.task import Sources
 
 _BETTER = "better by"
 _SPEED = ("median_ms", "p95_ms", "p99_ms", "read_ms", "peer_ms", "ratio")
@@ -89,7 +96,7 @@ def method_table(results: Results, group: str, name: str) -> Table:
 
     def head(row: str) -> Entry:
         is_papers = any(results.theirs(group, at, row) for at in cases)
-        return Entry(shown[row], note=f"paper: {paper.NAMES[row]}" if is_papers else "")
+        return Entry(shown[row], note=f"paper: {PAPER_NAMES[row]}" if is_papers else "")
 
     cases = [*results.names(group), AVERAGE]
     beside = [_BETTER] if BASELINE in shown and len(shown) > 1 else []
@@ -127,7 +134,7 @@ def notes(results: Results) -> list[str]:
             lines.append(f"average of {group}: {over} figures of one of our methods at least")
     lines += _settings(results)
     lines += _clocks(results)
-    if any((s.name, row_of(name)) in paper.FIGURES for s in results.sequences for name in results.methods):
+    if any((s.name, row_of(name)) in PAPER_FIGURES for s in results.sequences for name in results.methods):
         lines.append(
             "lines 'paper:', or figures in brackets: Kerl, Stückler, Cremers, ICCV 2015, Tables 2 and 3, on their own "
             "recordings and renderings of such motions; rooms and images differ: compare the orders, not the digits"

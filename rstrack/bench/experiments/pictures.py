@@ -14,19 +14,19 @@ from typing import Any
 
 from rsgen.console.progress import Progress, no_progress
 from rsgen.errors import UserError
-from rsgen.files import atomic_write, read_text, write_error
-from rstrack.bench import paper
-from rstrack.bench.experiments.method_results import Results
-from rstrack.bench.experiments.methods import MAPPED, SequenceInfo, method_of
+from rsgen.files import atomic_write, write_error
+from rstrack.bench.experiments.methods import MAPPED, Results, SequenceInfo, method_of
+from rstrack.bench.figures import PAPER_FIGURES
 from rstrack.bench.record import CellRecord, figure, read_record
 from rstrack.bench.runner import RECORD
-from rstrack.bench.sequences import run_rsgen
+from rstrack.bench.task import run_rsgen
 from rstrack.charts.chart import Bars, Chart, method_colors, numbers
 from rstrack.charts.runs import compared_errors, path_chart
 from rstrack.charts.to_file import write_charts
 from rstrack.data.dataset import Dataset, open_dataset
+from rstrack.data.estimate import read_info
 from rstrack.mapping.map import run_map
-from rstrack.metrics.tracked import Tracked, load_run
+from rstrack.metrics.run_evaluate import Tracked, load_run
 from rstrack.options import MapOptions
 
 MESH = "mesh.ply"
@@ -62,7 +62,7 @@ def ate_chart(results: Results) -> Chart:
     colors = method_colors(rows)
     for row in rows:
         ours = [results.figure(name, variants[row], "ate_mm") for name, variants in zip(names, shown, strict=True)]
-        theirs = numbers([paper.FIGURES.get((name, row), {}).get("ate_mm") for name in names])
+        theirs = numbers([PAPER_FIGURES.get((name, row), {}).get("ate_mm") for name in names])
         bars.append(Bars(row, colors[row], numbers(ours), theirs))
     note = "Logarithmic. Marks on the bars: the paper's figures for that method, in its own rooms."
     if any(row != name for variants in shown for row, name in variants.items()):
@@ -228,10 +228,9 @@ def _draw(sequence: str, parts: list[dict[str, Any]], out: Path) -> Path:
 def _read(path: Path) -> dict[str, Any]:
     """A JSON object, empty if there is none."""
     try:
-        data = json.loads(read_text(path))
-    except (UserError, ValueError, RecursionError):
+        return read_info(path)
+    except UserError:
         return {}
-    return data if isinstance(data, dict) else {}
 
 
 def _json(record: dict[str, Any]) -> bytes:

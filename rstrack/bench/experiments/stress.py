@@ -14,20 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from rsgen.console.progress import Progress, no_progress
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import atomic_write, encode_yaml, read_text, read_yaml
 from rsgen.geometry.spline import Spline
 from rsgen.sequence.format import pose_rows
-from rstrack.bench.cells import Benchmark, Cell
-from rstrack.bench.definitions import CaseEntry, MethodEntry, SequenceEntry
+from rstrack.bench.cells import Benchmark, CaseEntry, Cell, MethodEntry, SequenceEntry
 from rstrack.bench.experiments.methods import given_options
 from rstrack.bench.measures.blur import weights_key
 from rstrack.bench.record import CellRecord
-from rstrack.bench.sequences import Sources
 from rstrack.bench.tables import failures
+from rstrack.bench.task import Sources
 from rstrack.options import Options
 
 STRESS = "stress.json"
@@ -204,7 +203,7 @@ class StressResult:
     @property
     def panels(self) -> Path | None:
         """Folder of the pictures of one keyframe, relative to the test's."""
-        return None if self.pictured is None else Path("cells", self.pictured.record.cell, "panels")
+        return None if self.pictured is None else self.pictured.record.folder / "panels"
 
     def fused(self, poses: str) -> list[StressCell]:
         """The cells that have keyframes fused along a path."""
@@ -231,13 +230,12 @@ def stress_result(records: Iterable[CellRecord]) -> StressResult:
 
 def read_stress(out: Path) -> StressResult:
     """What `write_stress` has written into `out`. Raises UserError naming the first wrong field."""
-    path = Path(out) / STRESS
+    path, again = Path(out) / STRESS, ": run 'rstrack bench stress' again"
+    records = validated(_STORED.validate_json, read_text(path), path, cure=again)
     try:
-        result = stress_result(_STORED.validate_json(read_text(path)))
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)}: run 'rstrack bench stress' again") from None
+        result = stress_result(records)
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path}: is no stress test's ({error!r}): run 'rstrack bench stress' again") from None
+        raise UserError(f"{path}: is no stress test's ({error!r}){again}") from None
     if not result.cells:
-        raise UserError(f"{path}: holds no records: run 'rstrack bench stress' again")
+        raise UserError(f"{path}: holds no records{again}")
     return result

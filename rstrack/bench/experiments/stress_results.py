@@ -11,7 +11,6 @@ from typing import Any
 from rsgen.console.progress import Progress
 from rsgen.console.tables import Entry, Table, fixed
 from rstrack.bench.cells import Benchmark
-from rstrack.bench.experiments.run import Written
 from rstrack.bench.experiments.stress import (
     PATHS,
     STRESS,
@@ -23,9 +22,9 @@ from rstrack.bench.experiments.stress import (
 )
 from rstrack.bench.measures.blur import read_panels
 from rstrack.bench.record import CellRecord, write_records
-from rstrack.bench.runner import Outcome
-from rstrack.bench.sequences import Sources
+from rstrack.bench.runner import Outcome, Written
 from rstrack.bench.tables import pivot, provenance, write_tables
+from rstrack.bench.task import Sources
 from rstrack.charts.chart import COLORS, TRUE_COLOR, Chart, Curve, numbers
 from rstrack.charts.to_file import write_charts
 
@@ -37,18 +36,6 @@ _SCORES = (
     ("gradient", "Gradient energy over that of the sharp view", 3, 1.0),
 )
 _Value = Callable[["StressCell", float | None], float | None]
-
-
-def stress_tables(result: StressResult) -> list[Table]:
-    """All of them."""
-    color = [table for poses in PATHS for table in color_tables(result, poses)]
-    return [*color, *depth_tables(result), tracking_table(result)]
-
-
-def stress_notes(result: StressResult) -> list[str]:
-    """What a reader has to know about them, one line each."""
-    about = f"blur stress test of {result.motion}: colour against the sharp view, means over keyframes"
-    return [about, *result.failed, provenance(cell.record for cell in result.cells)]
 
 
 def color_tables(result: StressResult, poses: str) -> list[Table]:
@@ -153,16 +140,18 @@ def write_stress(records: Iterable[CellRecord], out: Path) -> tuple[StressResult
     records = tuple(records)
     result = stress_result(records)
     write_records(out / STRESS, records)
-    return result, write_tables(out, stress_tables(result), stress_notes(result), csv_rows(result), "stress")
+    color = [table for poses in PATHS for table in color_tables(result, poses)]
+    tables = [*color, *depth_tables(result), tracking_table(result)]
+    about = f"blur stress test of {result.motion}: colour against the sharp view, means over keyframes"
+    notes = [about, *result.failed, provenance(cell.record for cell in result.cells)]
+    return result, write_tables(out, tables, notes, csv_rows(result), "stress")
 
 
 def draw_stress(result: StressResult, out: Path) -> None:
     """Write stress.png and, of one keyframe, panels.png. Raises UserError."""
     title = f"{result.motion}: fused colour along the true path, and tracking"
     write_charts([*color_charts(result, "true"), tracking_chart(result)], out / "stress.png", title)
-    folder = None if result.panels is None else out / result.panels
-    panels = None if folder is None else read_panels(folder)
-    if folder is None or panels is None:
+    if result.panels is None or (panels := read_panels(out / result.panels)) is None:
         return
     names = (
         "registered blurred input", f"weights (white: {panels.white:.2g})", "constant weights", "blur-aware weights",
@@ -170,7 +159,7 @@ def draw_stress(result: StressResult, out: Path) -> None:
     )  # fmt: skip
     from rsgen.figures import save_grid
 
-    save_grid([[image / 255.0 for image in panels.images(folder).values()]], names, out / "panels.png")
+    save_grid([[image / 255.0 for image in panels.images(out / result.panels).values()]], names, out / "panels.png")
 
 
 def color_charts(result: StressResult, poses: str) -> list[Chart]:

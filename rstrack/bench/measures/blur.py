@@ -6,16 +6,20 @@ psnr_db_true_sigma1, psnr_db_estimated_constant. The setting `sigmas_px` has the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from rsgen.array_types import BoolArray, ByteArray
 from rsgen.console.progress import Progress
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import atomic_write, read_text
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png, read_png
@@ -25,7 +29,6 @@ from rstrack.bench.task import Task
 from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import Estimate
 from rstrack.mapping.keyframes import BlurSigma, FusedKeyframe, depth_errors, fused_keyframes
-from rstrack.metrics.images import gradient_energy, psnr_db, ssim
 from rstrack.options import Options
 
 POSES = ("true", "estimated")
@@ -35,6 +38,7 @@ PANELS = ("registered", "weights", "constant", "blur_aware", "sharp_view")
 # Seconds within which a keyframe and the sharp truth are of the same instant.
 _SAME_INSTANT_S = 1e-4
 _TRUTH = "global_middle"
+_WINDOW = 11
 
 
 def blur_cell(task: Task, progress: Progress) -> Figures:
@@ -46,7 +50,7 @@ def blur_cell(task: Task, progress: Progress) -> Figures:
     figures = accuracy(task, estimate) | figures
     for poses, spline, covers in _paths(dataset, estimate):
         progress("fusing", 1.0, f"along the {poses} path")
-        keyframes = list(fused_keyframes(dataset, spline, (None, *sigmas), task.options, None, covers))
+        keyframes = list(fused_keyframes(dataset, spline, (None, *sigmas), task.options, covers))
         figures |= _color(keyframes, dataset, poses) | _depth(keyframes, dataset, task.options, poses)
         if poses == "true" and keyframes and sigmas:
             _write_panels(keyframes, dataset, min(sigmas, key=lambda s: abs(s - 1.0)), task.out / "panels")
@@ -91,10 +95,7 @@ def read_panels(folder: Path) -> Panels | None:
     if not folder.is_dir():
         return None
     path = folder / "panels.json"
-    try:
-        return Panels.model_validate_json(read_text(path))
-    except ValidationError as error:
-        raise UserError(f"{path}: {first_problem(error)}") from None
+    return validated(Panels.model_validate_json, read_text(path), path)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -170,3 +171,46 @@ def _write_panels(keyframes: Sequence[FusedKeyframe], truth: Dataset, sigma: flo
     height, width = weights.shape
     about = Panels(keyframe=best.index, width=width, height=height, white=white)
     atomic_write(folder / "panels.json", (about.model_dump_json(indent=1) + "\n").encode())
+
+
+def psnr_db(image: ByteArray, truth: ByteArray, known: BoolArray) -> float:
+    """Peak signal-to-noise ratio in dB of sRGB code values (h, w, 3) over the known pixels (h, w); inf if equal."""
+    if not known.any() or (image[known] == truth[known]).all():
+        return math.inf if known.any() else math.nan
+    return float(peak_signal_noise_ratio(truth[known], image[known]))
+
+
+def ssim(image: ByteArray, truth: ByteArray, known: BoolArray) -> float:
+    """Mean structural similarity of the grey images over pixels whose whole window is known; NaN if there are none.
+
+    Wang, Bovik, Sheikh, Simoncelli, IEEE TIP 13(4), 2004: window of 11 px with σ = 1.5 px, constants for 8 bit.
+    """
+    _, likeness = structural_similarity(
+        _grey(image), _grey(truth), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255.0,
+        full=True,
+    )  # fmt: skip
+    return _mean(likeness, _eroded(known, _WINDOW // 2))
+
+
+def gradient_energy(image: ByteArray, known: BoolArray) -> float:
+    """Mean squared gradient of the grey image, (code values / px)², where both neighbours on each axis are known."""
+    grey = _grey(image)
+    energy = np.zeros_like(grey)
+    energy[:, 1:-1] += (0.5 * (grey[:, 2:] - grey[:, :-2])) ** 2
+    energy[1:-1] += (0.5 * (grey[2:] - grey[:-2])) ** 2
+    return _mean(energy, _eroded(known, 1))
+
+
+def _grey(image: ByteArray) -> npt.NDArray[np.float64]:
+    return np.asarray(image.astype(np.float64) @ (0.299, 0.587, 0.114))
+
+
+def _eroded(known: BoolArray, reach: int) -> BoolArray:
+    """Pixels (h, w) whose square neighbourhood lies within the image and is known."""
+    padded = cv2.copyMakeBorder(known.astype(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=0)
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.erode(padded, kernel)[reach:-reach, reach:-reach] > 0)
+
+
+def _mean(values: npt.NDArray[np.float64], where: BoolArray) -> float:
+    return float(values[where].mean()) if where.any() else math.nan

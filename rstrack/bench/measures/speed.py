@@ -18,10 +18,9 @@ from pydantic import Field
 
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
-from rstrack.bench.definitions import StrictModel
-from rstrack.bench.record import Figures
-from rstrack.bench.sequences import Absent
-from rstrack.bench.task import Task, settings_of
+from rstrack.bench.cells import StrictModel
+from rstrack.bench.record import Figures, frame_times
+from rstrack.bench.task import Absent, Task, settings_of
 from rstrack.data.dataset import registered_image
 from rstrack.data.registration import Registrar
 from rstrack.options import PEERS, Peer
@@ -130,9 +129,8 @@ class _Timed:
         if parts:
             parts["other"] = mean - sum(parts.values())
         return {
-            "frames": len(ms), "median_ms": float(np.median(ms)), "mean_ms": mean,
-            "p95_ms": float(np.percentile(ms, 95)), "p99_ms": float(np.percentile(ms, 99)), "max_ms": float(ms.max()),
-            "read_ms": float(read.mean()), **{f"part_{name}_ms": parts[name] for name in sorted(parts)},
+            "frames": len(ms), **frame_times(ms), "max_ms": float(ms.max()), "read_ms": float(read.mean()),
+            **{f"part_{name}_ms": parts[name] for name in sorted(parts)},
             "keyframes": self.tracker.keyframes, "lost": sum(report.lost for report in self.tracker.reports[warm_up:]),
         }  # fmt: skip
 

@@ -13,15 +13,14 @@ from scipy.spatial.transform import Rotation
 from rsgen.console.progress import Progress
 from rsgen.errors import UserError
 from rstrack.bench.cells import Cell
-from rstrack.bench.record import Figures
-from rstrack.bench.sequences import Absent
-from rstrack.bench.task import Task
+from rstrack.bench.record import Figures, frame_times
+from rstrack.bench.task import Absent, Task
 from rstrack.data.estimate import Estimate, read_estimate, write_estimate
 from rstrack.metrics.association import ASSOCIATE_WITHIN_S, Truth, angles_deg, compare, truth_of
-from rstrack.metrics.clock import shifted
 from rstrack.metrics.consistency import LEVELS, TruthNoise
 from rstrack.metrics.evaluate import Metrics
 from rstrack.metrics.run_evaluate import evaluate_clocks, evaluate_extrinsics
+from rstrack.metrics.truth_fit import shifted
 from rstrack.options import CLOUD_PEERS, SLAM_PEERS
 from rstrack.peers.peer import run_command
 from rstrack.tracking.runs.run import track
@@ -149,10 +148,7 @@ def _tracked(task: Task, progress: Progress) -> tuple[Estimate, Figures]:
     times = result.estimate.info["timings"]
     ms = np.asarray(times["frame_ms"], float)
     return result.estimate, {
-        "median_ms": float(np.median(ms)),
-        "mean_ms": float(ms.mean()),
-        "p95_ms": float(np.percentile(ms, 95)),
-        "p99_ms": float(np.percentile(ms, 99)),
+        **frame_times(ms),
         "first_ms": float(ms[:_FIRST].mean()),
         "start_s": times["start_s"],
         "end_s": times.get("loops_s", 0.0),

@@ -58,11 +58,6 @@ class ImageTiming:
             return self.stamp - 0.5 * self.exposure_s, p.depth_readout_s
         return p.color_time(self.stamp) - 0.5 * self.exposure_s, p.color_readout_s
 
-    def span(self, p: Parameters) -> tuple[float, float]:
-        """Times (s) within which its lines lie."""
-        first, readout = self.begin(p)
-        return min(first, first + readout), max(first, first + readout)
-
     def mid_time(self, p: Parameters) -> float:
         """Mid readout, s."""
         first, readout = self.begin(p)
@@ -165,8 +160,9 @@ def _algebra(twist: FloatArray) -> FloatArray:
 
 def span(images: Sequence[ImageTiming], p: Parameters) -> tuple[float, float]:
     """Times (s) within which the lines of all images lie."""
-    spans = [image.span(p) for image in images]
-    return min(begin for begin, _ in spans), max(end for _, end in spans)
+    begin = np.array([image.begin(p) for image in images])
+    ends = begin[:, 0], begin.sum(axis=1)
+    return float(np.min(ends)), float(np.max(ends))
 
 
 @dataclass(frozen=True)

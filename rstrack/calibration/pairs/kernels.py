@@ -16,58 +16,52 @@ from typing import Any
 
 import drjit as dr
 
-from rsgen.device.arrays import Engine, Numbers, quotient, recorded_with
+from rsgen.device.arrays import Engine, quotient, recorded_with
 from rsgen.device.lens import Lens, TracedCamera
 from rsgen.device.projection import TO_BASE, RollingProjection, Vector, gather, move, project, project_rolling
 from rstrack.alignment.block_sums import Blocks, Contribution, PixelGrid, Runs, block_slot, contribution, sizes, summed
 from rstrack.alignment.brightness import MID_GREY
 from rstrack.alignment.residuals import GeometricInput, evened, plane_distance
 from rstrack.calibration.pairs.images import ACROSS
-from rstrack.calibration.pairs.optics import Asked, moves, traced, turned_round, unknown_columns, without_error
-from rstrack.images.sampling import PyramidLevel, cubic_value_and_slope, surface
+from rstrack.calibration.pairs.optics import Asked, traced, turned_round, unknown_columns, without_error
+from rstrack.images.sampling import PyramidLevel, Raster, cubic_value_and_slope, surface
 
 
 @dataclass(frozen=True)
-class DepthPairInput(GeometricInput):
-    """Device arrays of the depth kernel, see `GeometricInput`, for all pairs of a launch.
+class PairInput:
+    """Device arrays of both kernels, for all pairs of a launch.
 
-    depth, rays_*: of the pixels that are compared, of each view and of all. Surfaces are atlases. to_base, from_base:
-    of all views' lines. launch: the launch's first pair, and the last of all, which it repeats where there are no more.
-    pairs: current view and reference of each pair. own: of each pair the reference's 1 / median depth (1/m), and gain
-    and offset. camera: `camera_table`; error: `error_table`. constants: units of the unknowns too.
-    """
-
-    launch: Any
-    pairs: Any
-    own: Any
-    camera: Any
-    error: Any
-
-
-@dataclass(frozen=True)
-class ColorPairInput:
-    """Device arrays of the colour kernel, likewise.
-
-    depth: z of what the colour camera sees of each view's depth (m, 0: none); to_base: poses of depth's lines. image:
-    atlas of intensities, NaN where they are unusable; from_base: the colour camera's lines; camera: its `camera_table`.
-    own: gain and offset of the current image against the reference's last.
+    depth: z (m, 0: none) of the pixels that are compared, of each view; rays_* (normalised): of these; to_base: depth's
+    lines, of all views. camera: `camera_table` of the one whose images points are looked up in; from_base: its lines.
+    launch: the launch's first pair, and the last of all, which it repeats where there are no more. pairs: current view
+    and reference of each pair. own: of each pair the reference's 1 / median depth (1/m), and gain and offset of the
+    current image against it. error: as in `Optics`. constants: those of `Scaling`, two of the kernel's own, and units
+    of the unknowns.
     """
 
     depth: Any
+    camera: Any
     rays_x: Any
     rays_y: Any
     to_base: Any
-    image: Any
     from_base: Any
     launch: Any
     pairs: Any
     own: Any
-    camera: Any
     error: Any
     constants: Any
 
 
-Given = DepthPairInput | ColorPairInput
+@dataclass(frozen=True)
+class DepthPairInput(GeometricInput, PairInput):
+    """And what of `GeometricInput` is the reference's surface: atlases."""
+
+
+@dataclass(frozen=True)
+class ColorPairInput(PairInput):
+    """And image: an atlas of intensities, NaN where they are unusable. depth: of what the colour camera sees."""
+
+    image: Any
 
 
 @dataclass(frozen=True)
@@ -85,35 +79,15 @@ class PairGrid:
     meant: Any
 
 
-@dataclass(frozen=True)
-class Compared(Numbers):
-    """Every stride-th pixel of every stride-th row of depth images, which stand below each other or side by side.
-
-    points: of one image.
-    """
-
-    COMPILED = ("by_rows",)
-
-    stride: int
-    columns: int
-    rows: int
-    points: int
-    by_rows: bool
-
-    @classmethod
-    def of(cls, lens: Lens, stride: int) -> Compared:
-        """Of a depth camera."""
-        columns, rows = (-(-size // stride) for size in (lens.camera.width, lens.camera.height))
-        return cls(stride, columns, rows, columns * rows, lens.shutter.by_rows)
-
-
-def pair_grid(e: Engine, compared: Compared, pixels: PixelGrid, given: Given) -> PairGrid:
-    """From pixels of images that stand below each other, or beside each other, in order of the pairs."""
-    stride, columns = compared.stride, compared.columns
+def pair_grid(e: Engine, depth: Lens, raster: Raster, pixels: PixelGrid, given: PairInput) -> PairGrid:
+    """From pixels of depth images, one after the other in order of the pairs: below each other where they are read by
+    rows, else side by side. raster: of one image."""
+    stride, columns = raster.stride, raster.columns
     column, row = (quotient(v, stride) for v in (pixels.x, pixels.y))
-    if compared.by_rows:
-        launched = quotient(row, compared.rows)
-        row = row - launched * compared.rows
+    if depth.shutter.by_rows:
+        rows = quotient(e.UInt(raster.count), columns)
+        launched = quotient(row, rows)
+        row = row - launched * rows
     else:
         launched = quotient(column, columns)
         column = column - launched * columns
@@ -122,7 +96,7 @@ def pair_grid(e: Engine, compared: Compared, pixels: PixelGrid, given: Given) ->
     current, reference = (dr.gather(e.UInt, given.pairs, 2 * pair + i) for i in range(2))
     return PairGrid(
         launched, pair, current, reference, row * columns + column, column * stride, row * stride, pixels.meant
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -141,10 +115,10 @@ class Point:
 
 
 def _points(
-    e: Engine, depth: Lens, compared: Compared, pixels: PairGrid, view: Any, asked: Asked, given: Given
-) -> Point:  # fmt: skip
+    e: Engine, depth: Lens, raster: Raster, pixels: PairGrid, view: Any, asked: Asked, given: PairInput
+) -> Point:
     """Of pixels of a view's depth image."""
-    z = dr.gather(e.Float, given.depth, view * compared.points + pixels.number)
+    z = dr.gather(e.Float, given.depth, view * raster.count + pixels.number)
     xn, yn = (dr.gather(e.Float, rays, pixels.number) for rays in (given.rays_x, given.rays_y))
     active = pixels.meant & (z > 0.0)
     z = without_error(e, asked, z, xn, yn, given.error)
@@ -187,12 +161,12 @@ class DepthResidual:
 
 
 def depth_residual(
-    e: Engine, depth: Lens, compared: Compared, pixels: PairGrid, asked: Asked, given: DepthPairInput
+    e: Engine, depth: Lens, raster: Raster, pixels: PairGrid, asked: Asked, given: DepthPairInput
 ) -> DepthResidual:
     """Equation (6) with rows' times on both sides."""
     lens = traced(e, depth, given.camera)
     width, height = depth.camera.width, depth.camera.height
-    at = _points(e, depth, compared, pixels, pixels.current, asked, given)
+    at = _points(e, depth, raster, pixels, pixels.current, asked, given)
     first = pixels.reference * depth.lines
     seen = project_rolling(lens, given.from_base, at.p, e.UInt, e.Int, first)
     x, y = in_atlas(pixels.reference, width, height, seen.x, seen.y)
@@ -230,7 +204,7 @@ class ColorResidual:
 
 
 def color_residual(
-    e: Engine, color: Lens, depth: Lens, compared: Compared, pixels: PairGrid, level: PyramidLevel, asked: Asked,
+    e: Engine, color: Lens, depth: Lens, raster: Raster, pixels: PairGrid, level: PyramidLevel, asked: Asked,
     given: ColorPairInput,
 ) -> ColorResidual:  # fmt: skip
     """Intensities of the level, the reference's with the gain and offset that the current image has."""
@@ -245,20 +219,13 @@ def color_residual(
         return seen, value, seen.chain(dx * shrink, dy * shrink, 0.0), active
 
     lens = traced(e, color, given.camera)
-    at = _points(e, depth, compared, pixels, pixels.reference, asked, given)
+    at = _points(e, depth, raster, pixels, pixels.reference, asked, given)
     here, value, own, active = looked_up(pixels.current, at.active)
     there, ref, other, active = looked_up(pixels.reference, active)
     gain, offset = (dr.gather(e.Float, given.own, 3 * pixels.pair + i) for i in (1, 2))
     contrast = ref - MID_GREY
     r = value - (ref + dr.fma(gain, contrast, offset))
     return ColorResidual(lens, at.p, here, there, r, own, other, gain, contrast, active)
-
-
-@dataclass(frozen=True)
-class PairSize(Numbers):
-    """Integers that a pair's sums have."""
-
-    size: int
 
 
 def _room(pairs: int, size: int) -> int:
@@ -273,24 +240,19 @@ def depth_pair_kernel(e: Engine, depth: Lens, stride: int, asked: Asked, pairs: 
     """Kernel of the depth term: for each pair the sums over pairs of blocks (current, reference) of depth lines."""
     names = asked.depth
     size, values = sizes(depth, depth, len(names))
-    of_lens = depth, Compared.of(depth, stride), Blocks.of(depth, depth), _runs(e, depth, stride, pairs)
+    of_lens = depth, Raster.of(depth.camera, stride), Blocks.of(depth, depth), _runs(e, depth, stride, pairs)
 
-    @recorded_with(e, DepthPairInput, *of_lens, PairSize(size))
-    def kernel(
-        given: DepthPairInput, depth: Lens, compared: Compared, blocks: Blocks, runs: Runs, pair: PairSize
-    ) -> Any:  # fmt: skip
+    @recorded_with(e, DepthPairInput, *of_lens)
+    def kernel(given: DepthPairInput, depth: Lens, raster: Raster, blocks: Blocks, runs: Runs) -> Any:
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
-            grid = pair_grid(e, compared, pixels, given)
-            of_pixel = depth_residual(e, depth, compared, grid, asked, given)
-            point, seen, columns = of_pixel.at, of_pixel.seen, []
-            if names:
-                own = project(of_pixel.lens.camera, point.q), seen.at
-                here, there = (moves(names, of_pixel.lens.camera, one) for one in own)
-                shifts = zip(there, here, strict=True)
-                columns = unknown_columns(e, of_pixel.g, shifts, seen.M, point.T_base_cam, given.constants)
-            slot = grid.launched * pair.size + block_slot(point.line, seen.row, blocks, grid.y, len(names))
+            grid = pair_grid(e, depth, raster, pixels, given)
+            of_pixel = depth_residual(e, depth, raster, grid, asked, given)
+            point, seen, camera = of_pixel.at, of_pixel.seen, of_pixel.lens.camera
+            both = (seen.at, seen.M), (project(camera, point.q), point.T_base_cam)
+            columns = unknown_columns(e, names, camera, of_pixel.g, *both, given.constants)
+            slot = grid.launched * size + block_slot(point.line, seen.row, blocks, grid.y, len(names))
             judged = of_pixel.is_smooth, len(names)
             motion = of_pixel.g, point.p, 1.0, of_pixel.r, of_pixel.active
             return contribution(e, *motion, parameters, slot, columns, *judged)
@@ -309,26 +271,25 @@ def color_pair_kernel(
     """
     names = asked.color
     size, values = sizes(color, color, len(names) + 2)
-    of_depth = depth, Compared.of(depth, stride), _runs(e, depth, stride, pairs)
-    of_color = color, PyramidLevel.of(color.camera, level), Blocks.of(color, color), PairSize(size)
+    of_depth = depth, Raster.of(depth.camera, stride), _runs(e, depth, stride, pairs)
+    of_color = color, PyramidLevel.of(color.camera, level), Blocks.of(color, color)
 
     @recorded_with(e, ColorPairInput, *of_depth, *of_color)
     def kernel(
-        given: ColorPairInput, depth: Lens, compared: Compared, runs: Runs, color: Lens, image: PyramidLevel,
-        blocks: Blocks, pair: PairSize,
+        given: ColorPairInput, depth: Lens, raster: Raster, runs: Runs, color: Lens, image: PyramidLevel,
+        blocks: Blocks,
     ) -> Any:  # fmt: skip
         parameters = [dr.gather(e.Float, given.constants, e.UInt(i)) for i in range(7)]
 
         def at(pixels: PixelGrid) -> Contribution:
-            grid = pair_grid(e, compared, pixels, given)
-            of = color_residual(e, color, depth, compared, grid, image, asked, given)
-            here, there, columns = of.here, of.there, []
+            grid = pair_grid(e, depth, raster, pixels, given)
+            of = color_residual(e, color, depth, raster, grid, image, asked, given)
+            here, there = of.here, of.there
             a, b, c = (0.5 * dr.fma(1.0 + of.gain, two, one) for one, two in zip(of.own, of.other, strict=True))
-            if names:
-                shifts = zip(*(moves(names, of.lens.camera, seen.at) for seen in (here, there)), strict=True)
-                columns = unknown_columns(e, (a, b, c), shifts, here.M, turned_round(there.M), given.constants)
+            both = (here.at, here.M), (there.at, turned_round(there.M))
+            columns = unknown_columns(e, names, of.lens.camera, (a, b, c), *both, given.constants)
             columns += [-of.contrast, e.Float(-1.0)]
-            slot = grid.launched * pair.size + block_slot(here.row, there.row, blocks, here.y, len(columns))
+            slot = grid.launched * size + block_slot(here.row, there.row, blocks, here.y, len(columns))
             # A twist of the camera moves the point the other way.
             return contribution(e, (a, b, c), of.p, -1.0, of.r, of.active, parameters, slot, columns, True, len(names))
 

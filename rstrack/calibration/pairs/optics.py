@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,6 @@ from rsgen.device.lens import Lens, TracedCamera, camera_numbers
 from rsgen.device.projection import Projection, Vector
 from rsgen.geometry.camera import Camera
 from rstrack.calibration.parameters import DEPTH, LENS, NAMES
-from rstrack.data.rig import DepthError
 
 # Coefficients of distortion at most.
 _BENDS = 8
@@ -50,7 +49,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class Optics:
-    """On the device: normalised coordinates of depth's pixels, `camera_table` of both, `error_table`."""
+    """On the device: normalised coordinates of depth's pixels, `camera_table` of both, error (3,): see DEPTH."""
 
     rays_x: Any
     rays_y: Any
@@ -74,7 +73,7 @@ def traced(e: Engine, lens: Lens, table: Any) -> Lens:
 
 
 def without_error(e: Engine, asked: Asked, z: Any, xn: Any, yn: Any, table: Any) -> Any:
-    """Depth on the device, along rays (xn, yn), as `DepthError.corrected` has it."""
+    """Depth on the device, along rays (xn, yn), as `DepthError.corrected` has it; table: `Optics.error`."""
     if not asked.corrects:
         return z
     offset, inverse_offset, radial = (dr.gather(e.Float, table, e.UInt(i)) for i in range(len(DEPTH)))
@@ -110,18 +109,18 @@ def moves(names: Sequence[str], camera: Camera, at: Projection) -> list[Vector]:
 
 
 def unknown_columns(
-    e: Engine, g: Vector, shifts: Iterable[tuple[Vector, Vector]], cam_base: list[Any], base_cam: list[Any],
-    constants: Any,
+    e: Engine, names: Sequence[str], camera: Camera, g: Vector, seen: tuple[Projection, list[Any]],
+    other: tuple[Projection, list[Any]], constants: Any,
 ) -> list[Any]:  # fmt: skip
-    """Columns of unknowns, at most 1, from g, the derivative by a shift in the base frame.
+    """Columns of unknowns of a camera, at most 1, from g, the derivative by a shift in the base frame.
 
-    shifts: by `moves`, in the camera that sees the point (cam_base: its R_cam_base, as `gather` has it), and in the
-    other one (base_cam: its R_base_cam). constants: `units` from the ninth on.
+    seen: where the image that sees the point has it, and its R_cam_base, as `gather` has it; other: likewise of the
+    other image, but R_base_cam. constants: `units` from the ninth on.
     """
     bound, found = dr.gather(e.Float, constants, e.UInt(3)), []
-    back = turned_round(cam_base)
-    for k, (there, here) in enumerate(shifts):
-        a, b = turn(back, there), turn(base_cam, here)
+    back, shifts = turned_round(seen[1]), (moves(names, camera, at) for at, _ in (seen, other))
+    for k, (there, here) in enumerate(zip(*shifts, strict=True)):
+        a, b = turn(back, there), turn(other[1], here)
         c = g[0] * (a[0] - b[0]) + g[1] * (a[1] - b[1]) + g[2] * (a[2] - b[2])
         unit = dr.gather(e.Float, constants, e.UInt(9 + k)) * bound
         found.append(dr.clip(c / unit, -1.0, 1.0))
@@ -143,8 +142,3 @@ def units(names: Sequence[str], median_depth: float) -> FloatArray:
     """Units (n,) of the columns of such unknowns: what they then come to is like that of a twist."""
     power = np.array([1.0 if name in LENS else 2.0 * (name != DEPTH[0]) for name in names])
     return np.array([_SHOWN * _MOVES[name] for name in names]) * median_depth**power
-
-
-def error_table(error: DepthError) -> FloatArray:
-    """What `without_error` takes (3,)."""
-    return np.array([error.offset_m, error.inverse_offset, error.radial])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -14,18 +14,12 @@ from rsgen.array_types import BoolArray, FloatArray, IntArray
 from rsgen.device.arrays import Engine, Kernels, aligned
 from rsgen.device.lens import Lens
 from rsgen.geometry.camera import Camera
-from rstrack.alignment.block_sums import Scaling, block_counts, sizes
+from rstrack.alignment.block_sums import BlockSums, Scaling, block_counts, sizes
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
-from rstrack.calibration.pairs.chain import PairSums, pair_sums
 from rstrack.calibration.pairs.images import LinePoses, WindowImages, pair_lens
-from rstrack.calibration.pairs.kernels import (
-    ColorPairInput,
-    DepthPairInput,
-    color_pair_kernel,
-    depth_pair_kernel,
-)
-from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, error_table, units
-from rstrack.calibration.parameters import COLOR_LENS, COUNT, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
+from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, color_pair_kernel, depth_pair_kernel
+from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, units
+from rstrack.calibration.parameters import COLOR_LENS, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import NO_DEPTH_ERROR, DepthError
 
@@ -37,27 +31,42 @@ _POINTS = 4800
 _CROWDED = 4
 
 
-@dataclass
+@dataclass(frozen=True)
+class PairSums:
+    """Sums of p pairs of images, of those u pairs of their blocks that have pixels.
+
+    blocks: see `BlockSums`, the pairs of blocks as current ones. begin (p + 1,): where a pair of images begins among
+    these. current, reference (u,): numbers of the blocks among those of all images. coupling (u, 6, n), own_H (p, n, n)
+    and own_g (p, n): further columns', see `ColumnSums`, the latter two of each pair, or (1, ...) of all together.
+    """
+
+    blocks: BlockSums
+    begin: IntArray
+    current: IntArray
+    reference: IntArray
+    coupling: FloatArray
+    own_H: FloatArray
+    own_g: FloatArray
+
+
 class PairTerms:
-    """The kernels of one rig. depth, color: lenses of `pair_lens`; asked: what of them is unknown."""
+    """The kernels of a dataset's rig. depth, color: lenses of `pair_lens`; asked: what of them is unknown."""
 
-    e: Engine
-    depth: Lens
-    color: Lens
-    asked: Asked
-    _kernel: Kernels = field(init=False)
-    _optics: tuple[tuple[Camera, Camera, DepthError], Optics] | None = None
-
-    def __post_init__(self) -> None:
-        self._kernel = Kernels(self.e)
+    def __init__(self, e: Engine, dataset: Dataset, free: BoolArray) -> None:
+        """With columns for those lens and depth unknowns (31,) that are free."""
+        rig = dataset.rig
+        self.depth = pair_lens(rig.depth_camera, rig.depth_shutter)
+        self.color = pair_lens(rig.color_camera, rig.color_shutter)
+        self.e, self.asked, self._kernel = e, _asked(dataset, free), Kernels(e)
+        self._optics: tuple[tuple[Camera, Camera, DepthError], Optics] | None = None
 
     def optics(self, p: Parameters) -> Optics:
         """Rays of the pixels that are compared, cameras and depth's error, on the device."""
         now = *self.cameras(p), p.error
         if self._optics is None or self._optics[0] != now:
-            e, (depth, color, error) = self.e, now
+            e, (depth, color, _) = self.e, now
             rays = np.nan_to_num(depth.unproject(depth.pixel_grid()[:: self.stride, :: self.stride])[..., :2])
-            tables = camera_table(depth), camera_table(color), error_table(error)
+            tables = camera_table(depth), camera_table(color), p.depth_error
             found = Optics(*(e.upload(given) for given in (rays[..., 0], rays[..., 1], *tables)))
             self._optics = now, found
         return self._optics[1]
@@ -102,11 +111,9 @@ class PairTerms:
         gate = max(GATE_SIGMAS * sigma, 10.0 * FLOOR_DEPTH)
         unit = units(self.asked.depth, scaling.median_depth)
         constants = np.concatenate([scaling.parameters(sigma, gate), [_SMOOTH * sigma, 0.0], unit])
-        tables = self.e.upload(lines.to_base), self.e.upload(lines.from_base)
+        given = self._of_pairs(images, pairs, (lines, lines), optics, np.zeros((len(pairs), 2)), constants)
         surfaces = images.inverse_depth, images.slope_x, images.slope_y, images.roughness
-        geometric = images.z, optics.rays_x, optics.rays_y, tables[0], *surfaces, tables[1]
-        of_pairs = self._of_pairs(images, pairs, np.zeros((len(pairs), 2)))
-        return DepthPairInput(*geometric, self.e.upload(constants), *of_pairs, optics.depth_camera, optics.error)
+        return DepthPairInput(*(images.z, optics.depth_camera, *given, *surfaces))
 
     def color_input(
         self, images: WindowImages, level: int, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
@@ -115,16 +122,18 @@ class PairTerms:
         """What the colour kernel takes; see `by_color`."""
         unit = units(self.asked.color, scaling.median_depth)
         constants = np.concatenate([scaling.parameters(sigma, GATE_INTENSITY), [0.0, 0.0], unit])
-        points = images.shown_z, optics.rays_x, optics.rays_y, self.e.upload(lines[0].to_base)
-        seen = images.levels[level], self.e.upload(lines[1].from_base)
-        of_pairs = self._of_pairs(images, pairs, brightness[pairs[:, 0], pairs[:, 1]])
-        return ColorPairInput(*points, *seen, *of_pairs, optics.color_camera, optics.error, self.e.upload(constants))
+        given = self._of_pairs(images, pairs, lines, optics, brightness[pairs[:, 0], pairs[:, 1]], constants)
+        return ColorPairInput(*(images.shown_z, optics.color_camera, *given, images.levels[level]))
 
-    def _of_pairs(self, images: WindowImages, pairs: IntArray, brightness: FloatArray) -> tuple[Any, Any, Any]:
-        """`launch`, of all, `pairs` and `own` of the inputs."""
-        own = np.column_stack([1.0 / images.median_depth[pairs[:, 1]], brightness])
-        whole = self.e.UInt(aligned([0, len(pairs) - 1], np.uint32))
-        return whole, self.e.UInt(aligned(pairs, np.uint32)), self.e.upload(own)
+    def _of_pairs(
+        self, images: WindowImages, pairs: IntArray, lines: tuple[LinePoses, LinePoses], optics: Optics,
+        brightness: FloatArray, constants: FloatArray,
+    ) -> tuple[Any, ...]:  # fmt: skip
+        """What `PairInput` has from rays_x on, all pairs in one launch; lines: of depth and of what is looked into."""
+        e, own = self.e, np.column_stack([1.0 / images.median_depth[pairs[:, 1]], brightness])
+        launch, of = (e.UInt(aligned(numbers, np.uint32)) for numbers in ([0, len(pairs) - 1], pairs))
+        placed = optics.rays_x, optics.rays_y, e.upload(lines[0].to_base), e.upload(lines[1].from_base)
+        return *placed, launch, of, e.upload(own), optics.error, e.upload(constants)
 
     def _in_launches(
         self, given: DepthPairInput | ColorPairInput, what: tuple[Any, ...], pairs: IntArray, scaling: Scaling,
@@ -141,7 +150,7 @@ class PairTerms:
         def found() -> PairSums:
             whole = np.concatenate([one.numpy()[: each * size] for one in raw])[: len(pairs) * size]
             apart = what[0] is color_pair_kernel
-            return pair_sums(whole, scaling, pairs, block_counts(lens, lens)[0], unit, apart)
+            return _pair_sums(whole, scaling, pairs, block_counts(lens, lens)[0], unit, apart)
 
         return found
 
@@ -157,16 +166,29 @@ class PairTerms:
         return Scaling(lever, bound, min(pixels, -(-_CROWDED * pixels // blocks)))
 
 
-def pair_terms(e: Engine, dataset: Dataset, free: BoolArray | None = None) -> PairTerms:
-    """The kernels of a dataset's rig, with columns for those lens and depth unknowns (31,) that are free."""
-    rig = dataset.rig
-    depth, color = pair_lens(rig.depth_camera, rig.depth_shutter), pair_lens(rig.color_camera, rig.color_shutter)
-    return PairTerms(e, depth, color, _asked(dataset, np.zeros(COUNT, bool) if free is None else free))
-
-
 def _asked(dataset: Dataset, free: BoolArray) -> Asked:
     one = dataset.rig.is_registered
     color = tuple(name for name, asked in zip(LENS, free[COLOR_LENS], strict=True) if asked)
     depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
     depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
     return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NO_DEPTH_ERROR, one)
+
+
+def _pair_sums(raw: IntArray, scaling: Scaling, pairs: IntArray, count: int, unit: FloatArray, apart: bool) -> PairSums:
+    """Integers (p, ...) as summed on the device, of pairs (p, 2) of images, current and reference, with `count` blocks.
+
+    unit (n,): what 1 of the further columns stands for. apart: some of these belong to one pair alone.
+    """
+    p, n = len(pairs), len(unit)
+    rows = raw.reshape(p * count**2, -1)
+    used = np.flatnonzero(rows.any(axis=1))
+    pair, of = used // count**2, used % count**2
+    blocks = scaling.unpack(rows[used], len(used), 1, n)
+    coupling = np.zeros((len(used), 6, 0)) if blocks.columns is None else blocks.columns.coupling[:, 0] * unit
+    totals = rows.reshape(p if apart else 1, -1, rows.shape[1]).sum(axis=1)
+    own = [each for total in totals if (each := scaling.unpack(total, 1, 1, n).columns) is not None]
+    own_H = np.array([each.H for each in own]).reshape(len(totals), n, n) * np.outer(unit, unit)
+    own_g = np.array([each.g for each in own]).reshape(len(totals), n) * unit
+    begin = np.searchsorted(pair, np.arange(p + 1))
+    current, reference = pairs[pair, 0] * count + of // count, pairs[pair, 1] * count + of % count
+    return PairSums(blocks, begin, current, reference, coupling, own_H, own_g)

@@ -15,15 +15,15 @@ import numpy as np
 import scipy.linalg
 
 from rsgen.array_types import FloatArray, IntArray
-from rstrack.alignment.block_sums import PixelGrid, Scaling, every
+from rstrack.alignment.block_sums import Scaling, every
 from rstrack.alignment.weights import FLOOR_DEPTH, GATE_INTENSITY, GATE_SIGMAS
 from rstrack.calibration.pairs.images import ACROSS, LinePoses, lines_of
-from rstrack.calibration.pairs.kernels import Compared, color_residual, depth_residual, in_atlas, pair_grid
+from rstrack.calibration.pairs.kernels import PairGrid, PairInput, color_residual, depth_residual, in_atlas, pair_grid
 from rstrack.calibration.pairs.optics import turn
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow
 from rstrack.calibration.parameters import Parameters
-from rstrack.images.sampling import PyramidLevel
+from rstrack.images.sampling import PyramidLevel, Raster
 
 
 def trust_in(window: RecordingWindow, terms: PairTerms, p: Parameters) -> float:
@@ -56,9 +56,8 @@ def _by_depth(
     """Derivatives (n, 6) of depth's residuals over σ by a twist, with the slopes of either image."""
     e, camera, sigma = terms.e, terms.depth.camera, window.sigma[0]
     given = terms.depth_input(window.images, pair, lines, terms.optics(p), np.inf, Scaling(lever, 1.0, 1))
-    compared = Compared.of(terms.depth, terms.stride)
-    grid = pair_grid(e, compared, _pixels(terms), given)
-    of = depth_residual(e, terms.depth, compared, grid, terms.asked, given)
+    raster, grid = _pair_grid(terms, given)
+    of = depth_residual(e, terms.depth, raster, grid, terms.asked, given)
     at, (x, y) = of.at, in_atlas(grid.current, camera.width, camera.height, grid.x, grid.y)
     own = y * (ACROSS * camera.width) + x
     own_x, own_y = (dr.gather(e.Float, slope, own) for slope in (given.slope_x, given.slope_y))
@@ -76,15 +75,15 @@ def _by_color(
     e, optics, sigma = terms.e, terms.optics(p), window.sigma[1]
     same, scaling = np.zeros_like(window.brightness), Scaling(lever, 1.0, 1)
     given = terms.color_input(window.images, 0, pair, lines, optics, same, sigma, scaling)
-    compared, level = Compared.of(terms.depth, terms.stride), PyramidLevel.of(terms.color.camera, 0)
-    grid = pair_grid(e, compared, _pixels(terms), given)
-    of = color_residual(e, terms.color, terms.depth, compared, grid, level, terms.asked, given)
+    (raster, grid), level = _pair_grid(terms, given), PyramidLevel.of(terms.color.camera, 0)
+    of = color_residual(e, terms.color, terms.depth, raster, grid, level, terms.asked, given)
     return _twists(of.p, of.own, of.other, of.active & (abs(of.r) < GATE_INTENSITY), sigma)
 
 
-def _pixels(terms: PairTerms) -> PixelGrid:
-    camera = terms.depth.camera
-    return every(terms.e, camera.width, camera.height, terms.stride)
+def _pair_grid(terms: PairTerms, given: PairInput) -> tuple[Raster, PairGrid]:
+    camera, stride = terms.depth.camera, terms.stride
+    raster, pixels = Raster.of(camera, stride), every(terms.e, camera.width, camera.height, stride)
+    return raster, pair_grid(terms.e, terms.depth, raster, pixels, given)
 
 
 def _twists(p: Any, g: Any, other: Any, active: Any, sigma: float) -> tuple[FloatArray, FloatArray]:

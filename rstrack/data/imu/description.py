@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from rsgen.array_types import FloatArray
-from rsgen.errors import UserError, first_problem
+from rsgen.errors import UserError, validated
 from rsgen.files import parse_yaml, read_text, read_yaml
 from rsgen.geometry import se3
 from rsgen.limits import rigid
-from rstrack.data.kalibr_camera_file import is_camchain, read_camchain
+from rstrack.data.foreign_camera_files import is_camchain, read_camchain
 from rstrack.data.rig import rigid_transform
 
 
@@ -257,11 +257,4 @@ def _invertible(path: Path, name: str, value: Matrix3 | None) -> FloatArray | No
 
 def _validated(path: Path, data: Mapping[str, Any], *within: str) -> _ImuYaml:
     """within: the entries that it lies in, for messages. Raises UserError."""
-    try:
-        return _ImuYaml.model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        if first["type"] == "extra_forbidden":
-            name = ".".join(str(part) for part in first["loc"])
-            raise UserError(f"{path}: {name}: no such entry: see docs/format.md, imu.yaml") from None
-        raise UserError(f"{path}: {first_problem(error, *within)}") from None
+    return validated(_ImuYaml.model_validate, data, path, *within, unknown="see docs/format.md, imu.yaml")

@@ -3,7 +3,7 @@
 To add a layout, write a module beside these and its line in LAYOUTS. The module has
 
     matches(root) -> bool                whether a folder has this layout
-    read(root, camera_file) -> Dataset   what is in it; `recorded.RecordedFolder` makes one of listed images and stamps
+    read(root, camera_file) -> Dataset   what is in it; `dataset.recorded_dataset` makes one of listed images and stamps
 """
 
 from __future__ import annotations

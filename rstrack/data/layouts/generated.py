@@ -21,7 +21,7 @@ from rsgen.sequence.reader import read_sequence
 from rsgen.sequence.trajectory import Trajectory
 from rstrack.data.camera_file import read_rig
 from rstrack.data.dataset import Dataset, group_colors
-from rstrack.data.registration import DepthSensor, registered_shutter
+from rstrack.data.registration import registered_shutter
 from rstrack.data.rig import DEFAULT_SIGMA, EXACT_SIGMA, CalibrationSigma, Rig, sigma_of_file
 from rstrack.data.timing import StampsMode, Timing, stream_timing
 
@@ -90,8 +90,7 @@ def _recorded(root: Path, sequence: Sequence) -> Dataset:
     color, depth = sequence.streams["color"], sequence.streams["depth"]
     shutter, late_s, T_color_depth = depth.shutter, 0.0, sequence.T_color_depth
     if depth.registered:
-        sensor = DepthSensor(depth.camera, depth.shutter, sequence.T_color_depth)
-        shutter, late_s = registered_shutter(color.camera, sensor)
+        shutter, late_s = registered_shutter(color.camera, depth.camera, depth.shutter, sequence.T_color_depth)
         T_color_depth = np.eye(4)
     rig = Rig(
         sequence.depth_image_camera, shutter, color.camera, color.shutter, T_color_depth, sigma=sigma_of(sequence)

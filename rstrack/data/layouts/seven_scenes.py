@@ -28,10 +28,9 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sequence.trajectory import Trajectory
-from rstrack.data.camera_file import RigFile, read_rig
-from rstrack.data.dataset import Dataset
-from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size, repeated
-from rstrack.data.layouts.recorded import RecordedFolder, find_camera_file, repeats_note
+from rstrack.data.camera_file import RigFile, find_camera_file, read_rig
+from rstrack.data.dataset import Dataset, recorded_dataset
+from rstrack.data.image_files import ImageFiles, decode_color, decode_depth, first_size, repeated, repeats_note
 from rstrack.data.rig import DEFAULT_SIGMA, Rig
 
 _NAME = re.compile(r"frame-(\d{1,9})\.(color\.png|color\.jpg|color\.jpeg|depth\.png|pose\.txt)")
@@ -72,15 +71,13 @@ def read(root: Path, camera_file: Path | None) -> Dataset:
     color_again, depth_again = repeated(list(color.values())), repeated(list(depth.values()))
     idle = _idle(*(np.array(n)[again] for n, again in zip(numbers, (color_again, depth_again), strict=True)))
     color, depth = _without(color, color_again), _without(depth, depth_again)
-    notes += tuple(
-        repeats_note(name, again) for name, again in (("depth", depth_again), ("colour", color_again)) if again.any()
-    )
+    notes += repeats_note("depth", depth_again) + repeats_note("colour", color_again)
     images = ImageFiles(file.rig, _UNITS_PER_M, tuple(color.values()), tuple(depth.values()), _MISSING)
     truth, without = _truth({k: path for k, path in poses.items() if k in depth or k not in numbers[1]}, idle)
     if without:
         notes = (*notes, f"{without} of {len(poses)} pose files hold no finite pose: there is no truth at these frames")
     stamps = _stamps(list(depth), idle), _stamps(list(color), idle)
-    return RecordedFolder(file, *stamps, images, truth, notes, _stamps(list(depth))).dataset(root)
+    return recorded_dataset(root, file, *stamps, images, truth, notes, _stamps(list(depth)))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
 """Folders in the layout of TUM RGB-D, among them Kerl et al.'s rolling-shutter sets, and of ICL-NUIM.
 
     rgb.txt, depth.txt    'stamp path' lines; or associations.txt with 'stamp path stamp path', depth or colour first
-    intrinsics.csv        optional: of each image; see `rstrack.data.own_intrinsics`
-    camera.yaml           the cameras: see `camera_file`; or an OpenCV calibration.yaml: see `opencv_camera_file`
+    intrinsics.csv        optional: of each image; see `rstrack.data.registration`
+    camera.yaml           the cameras: see `camera_file`; or an OpenCV calibration.yaml: see `foreign_camera_files`
     groundtruth.txt       optional: poses of the colour camera; ICL-NUIM's NAME.gt.freiburg also
 
 Stamps without any decimal point are frame numbers at 30 Hz, as in ICL-NUIM. Colour images are 8-bit PNG or JPEG, depth
@@ -22,9 +22,9 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.errors import UserError
 from rsgen.files import listed_file, read_text
-from rsgen.sequence.trajectory import ICL_RATE_HZ, Trajectory, read_trajectory
-from rstrack.data.camera_file import EXAMPLE, RigFile, read_rig
-from rstrack.data.dataset import Dataset
+from rsgen.sequence.trajectory import ICL_RATE_HZ, MAX_STAMP_S, Trajectory, read_trajectory
+from rstrack.data.camera_file import CAMERA_FILES, EXAMPLE, RigFile, find_camera_file, read_rig
+from rstrack.data.dataset import Dataset, recorded_dataset
 from rstrack.data.image_files import (
     ImageFiles,
     decode_color,
@@ -32,15 +32,14 @@ from rstrack.data.image_files import (
     decode_image,
     first_size,
     repeated,
+    repeats_note,
 )
-from rstrack.data.layouts.recorded import CAMERA_FILES, RecordedFolder, find_camera_file, repeats_note
-from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages, read_own_intrinsics
+from rstrack.data.registration import OwnIntrinsics, SharedImages, read_own_intrinsics
 from rstrack.data.rig import Rig
 
 _ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt")
 ESTIMATED = "# estimated, not measured: "
 """Begins the first line of a groundtruth.txt whose poses are another estimate from the same images."""
-_MAX_STAMP_S = 1e11  # the year 5138; today in milliseconds, microseconds or nanoseconds is beyond
 
 
 def matches(root: Path) -> bool:
@@ -66,7 +65,7 @@ def read(root: Path, camera_file: Path | None) -> Dataset:
     own_depth = read_own_intrinsics(root, "depth", stamps[0], file.rig.depth_camera)
     images = files if own_color is own_depth is None else SharedImages(files, own_color, own_depth)
     notes = (*depth_note, *color_note, *_own_notes(own_color, own_depth), *_truth_note(root))
-    return RecordedFolder(file, *stamps, images, _truth(root, file.rig), notes).dataset(root)
+    return recorded_dataset(root, file, *stamps, images, _truth(root, file.rig), notes)
 
 
 # --- listings --------------------------------------------------------------------------------------------------------
@@ -132,7 +131,7 @@ class _Listing:
         if not again.any():
             return self, ()
         new = tuple(entry for entry, is_repeat in zip(self.entries, again, strict=True) if not is_repeat)
-        return _Listing(self.root, self.file, new), (repeats_note(name, again),)
+        return _Listing(self.root, self.file, new), repeats_note(name, again)
 
     def _where(self, entry: _Entry) -> str:
         return f"{self.file} line {entry.line}"
@@ -144,7 +143,7 @@ class _Listing:
             seconds = math.nan
         if not math.isfinite(seconds):
             raise UserError(f"{self._where(entry)}: {entry.stamp[:40]!r} is not a time in seconds")
-        if abs(seconds) > _MAX_STAMP_S:
+        if abs(seconds) > MAX_STAMP_S:
             raise UserError(
                 f"{self._where(entry)}: stamp {entry.stamp[:40]} is absurd in seconds: divide nanoseconds by 1e9"
             )

@@ -29,8 +29,7 @@ from rstrack.inertial import estimate as inertial_estimate
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.consistency import HORIZONS_S, covariances, motion_covariance, motion_errors, step_nees
 from rstrack.metrics.evaluate import pairs_apart
-from rstrack.metrics.run_evaluate import RunEvaluation, evaluated
-from rstrack.metrics.tracked import load_run
+from rstrack.metrics.run_evaluate import RunEvaluation, evaluated, load_run
 from rstrack.options import Options
 from rstrack.tracking.runs.record import Noise
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rsgen.check.light import psnr_without_noise
+from rsgen.srgb import psnr_without_noise
 
 
 @pytest.mark.parametrize("wrong", [0.02, 0.0])

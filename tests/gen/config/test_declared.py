@@ -22,8 +22,7 @@ from rsgen.formats.export.kalibr import export_kalibr
 from rsgen.formats.export.registered import export_registered
 from rsgen.geometry import se3
 from rsgen.sequence.camera_yaml import TRUE_CAMERAS
-from rsgen.sequence.info import sequence_info
-from rsgen.sequence.reader import read_sequence
+from rsgen.sequence.reader import read_sequence, sequence_info
 from rstrack.data.dataset import open_dataset
 from rstrack.data.rig import sigma_of_file
 from rstrack.metrics.association import truth_of

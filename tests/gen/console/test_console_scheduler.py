@@ -20,11 +20,9 @@ import tiny
 from rsgen.cli.main import main
 from rsgen.config.config import Config, load_config
 from rsgen.console import scheduler
-from rsgen.console.scheduler import DaskWorkers, InProcess, open_workers
+from rsgen.console.scheduler import DaskWorkers, Workers, open_workers
 from rsgen.errors import UserError
-from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
-from rsgen.produce.generate import render_sequence
-from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
+from rsgen.produce.generate import RenderJob, render_block, render_sequence
 from rsgen.sequence.reader import read_sequence
 
 FRAMES = 15  # 30 images, 4 blocks
@@ -133,7 +131,7 @@ def wait_for(condition: Any) -> None:
 def test_every_job_is_done_once(remote: bool, workers: DaskWorkers, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scheduler, "_LEAST_AHEAD", 2)
     monkeypatch.setattr(scheduler, "_AHEAD_PER_WORKER", 0)
-    where, told = workers if remote else InProcess(), []
+    where, told = workers if remote else Workers(), []
     jobs = [3, 1, 2, 3, 5, 4]
     results = list(where.apply(square, jobs, lambda *what: told.append(what)))
     assert sorted(results) == [(i, job * job) for i, job in enumerate(jobs)]
@@ -172,24 +170,23 @@ def allow_failures(count: int, dask_scheduler: Any) -> int:
 
 
 @pytest.fixture(scope="module")
-def plan(config: Config) -> SequenceRecipe:
-    motion = load_motion(config)
-    stamps = sequence_stamps(config, motion)
-    return SequenceRecipe(config, motion.spline, stamps, engine_versions(config.backend), input_hashes(config))
+def job(config: Config, tmp_path_factory: pytest.TempPathFactory) -> RenderJob:
+    return tiny.render_job(config, tmp_path_factory.mktemp("sequence"), (0, "color"))
 
 
-def test_a_worker_that_would_render_something_else_says_so(plan: SequenceRecipe, tmp_path: Path) -> None:
-    def complaint(plan: SequenceRecipe) -> str:
+def test_a_worker_that_would_render_something_else_says_so(job: RenderJob, tmp_path: Path) -> None:
+    def complaint(job: RenderJob) -> str:
         with pytest.raises(UserError) as caught:
-            render_block(RenderJob(plan, ((0, "color"),)), silent)
+            render_block(job, silent)
         return str(caught.value)
 
-    assert "has mitsuba 3." in complaint(replace(plan, versions=dict(plan.versions) | {"mitsuba": "2.0"}))
-    gone = plan.config.scene.model_copy(update={"file": tmp_path / "scene.xml"})
-    moved = replace(plan, config=plan.config.model_copy(update={"scene": gone}))
+    config = job.writer.config
+    assert "has mitsuba 3." in complaint(replace(job, versions=dict(job.versions) | {"mitsuba": "2.0"}))
+    gone = config.scene.model_copy(update={"file": tmp_path / "scene.xml"})
+    moved = replace(job, writer=replace(job.writer, config=config.model_copy(update={"scene": gone})))
     assert "scene.xml: is missing: workers need the scene at the same path" in complaint(moved)
     for name in ("scene.xml", "paper.png"):
-        shutil.copy(plan.config.scene.file.parent / name, tmp_path)
+        shutil.copy(config.scene.file.parent / name, tmp_path)
     (tmp_path / "scene.xml").write_text((tmp_path / "scene.xml").read_text().replace("0.7, 0.3, 0.2", "0.2, 0.3, 0.7"))
     assert "another one here" in complaint(moved)
 

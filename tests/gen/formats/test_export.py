@@ -27,10 +27,10 @@ from rsgen.formats.export.shared import place_images
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.sensors.imu import exact_imu
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import pose_rows
 from rsgen.sequence.images import Sequence
 from rsgen.sequence.reader import read_sequence
-from rsgen.truth.settings import sequence_imu
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_images_are_copied_where_links_cannot_be(
 
     monkeypatch.setattr(shared.os, "link", no_link)
     source = plain.streams["color"].paths[0]
-    place_images([source], [tmp_path / "a.png"], False, no_progress)
+    place_images([source], tmp_path, False, no_progress, ["a.png"])
     assert (tmp_path / "a.png").read_bytes() == source.read_bytes()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections import defaultdict
 from dataclasses import replace
@@ -16,16 +17,15 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from rsgen.errors import UserError
-from rsgen.formats.export import bag
 from rsgen.formats.export.ros import export_ros, loss_of_tf
 from rsgen.formats.export.shared import ExportOptions, Storage
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.spline import Spline
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.format import ground_truth, poses_of_rows
 from rsgen.sequence.images import Sequence
 from rsgen.sequence.reader import read_sequence
-from rsgen.truth.settings import sequence_imu
 
 KINDS: list[tuple[str, Storage, str]] = [
     ("ros1", "sqlite3", "a.bag"),
@@ -293,7 +293,7 @@ def test_without_rosbags_and_before_time_0(sequence: Sequence, tmp_path: Path, m
     def absent(name: str) -> None:
         raise ImportError(name)
 
-    monkeypatch.setattr(bag.importlib, "import_module", absent)
+    monkeypatch.setattr(importlib, "import_module", absent)
     with pytest.raises(UserError, match="pip install 'rosbags"):
         export_ros(sequence, tmp_path / "a.bag", ExportOptions("ros1"))
     assert not list(tmp_path.iterdir())

@@ -15,8 +15,8 @@ from exported import IMU, make_plain, with_imu
 from rsgen.errors import UserError
 from rsgen.formats.export.rerun import export_rerun
 from rsgen.formats.export.video import write_video
+from rsgen.sensors.reports import sequence_imu
 from rsgen.sequence.images import Sequence
-from rsgen.truth.settings import sequence_imu
 
 
 @pytest.fixture(scope="module")

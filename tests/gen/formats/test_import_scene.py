@@ -18,10 +18,9 @@ from rsgen import formats, srgb
 from rsgen.cli.main import main
 from rsgen.errors import UserError
 from rsgen.formats.meshes.mesh_file import part_shapes
-from rsgen.formats.meshes.parts import Part
-from rsgen.formats.polygons import triangulate
-from rsgen.formats.scenes import content
-from rsgen.formats.scenes.import_scene import write_folder, write_scene
+from rsgen.formats.meshes.parts import Part, triangulate
+from rsgen.formats.scenes import import_scene
+from rsgen.formats.scenes.import_scene import Content, write_folder, write_scene
 from rsgen.scene.loading import content_hash, load_scene
 from rsgen.scene.material import Material, Texture, bsdf
 from rsgen.scene.placement import SceneOptions
@@ -112,7 +111,7 @@ def test_what_is_missing_is_said_in_one_line(
     (tmp_path / "a.usda").write_text("#usda 1.0\n")
     (tmp_path / "a.blend").write_bytes(b"BLENDER")
     (tmp_path / "a.txt").write_text("")
-    monkeypatch.setattr(content, "find_spec", lambda name: None)
+    monkeypatch.setattr(import_scene, "find_spec", lambda name: None)
     for name, text in [
         ("a.usda", "need the package usd-core, which is not installed: install it with: pip install"),
         ("a.blend", "need Blender's Python module bpy, which is not installed: install it with: pip install"),
@@ -144,7 +143,7 @@ def test_another_kind_of_scene_is_one_module_and_one_line(tmp_path: Path, monkey
         **part_shapes(mi, parts(path, options.scale), scratch),
     }
     module.hash_into = lambda digest, path, options: digest.update(repr(options.scale).encode())
-    module.read_content = lambda path, scale, up: content.Content(parts(path, scale or 1.0), [], ["boxes"])
+    module.read_content = lambda path, scale, up: Content(parts(path, scale or 1.0), [], ["boxes"])
     monkeypatch.setitem(sys.modules, module.__name__, module)
     for table in (formats.SCENES, formats.IMPORTS):
         monkeypatch.setitem(table, ".boxes", "meshes.boxes")

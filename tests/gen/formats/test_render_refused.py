@@ -13,8 +13,8 @@ from rendering import mi
 from scene_files import fails, hits, write_scene
 from trimesh.transformations import random_rotation_matrix
 
+from rsgen.formats.meshes.parts import is_convex, triangulated
 from rsgen.formats.mitsuba_xml.mesh_files import with_triangles
-from rsgen.formats.polygons import is_convex, triangulated
 from rsgen.scene.loading import content_hash, load_scene
 from rsgen.scene.meshes import surface
 

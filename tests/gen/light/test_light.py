@@ -27,15 +27,23 @@ from rendering import constant_twist, dr, mi
 from rsgen.config.config import LightConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.light import cache as lighting
-from rsgen.light.interpolation import denoised, thin
+from rsgen.light import bake as lighting
 from rsgen.light.lamps import _draw, left_to_rays, near_lamps
-from rsgen.light.sampling import CHANNELS, PATCH, about_normal, sampled_adaptively, standard_error, visible_error
+from rsgen.light.sampling import (
+    CHANNELS,
+    PATCH,
+    about_normal,
+    denoised,
+    sampled_adaptively,
+    standard_error,
+    thin,
+    visible_error,
+)
 from rsgen.light.sky import BINS, Guide, bin_of
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
-from rsgen.render.irradiance import make_field, make_lattice
+from rsgen.render.irradiance import IrradianceField, make_lattice
 from rsgen.sensors.color import to_srgb8
 
 
@@ -179,7 +187,7 @@ def test_a_guide_draws_what_it_says() -> None:
     toward = np.array([0.6, -0.48, 0.64])
     seen = toward + 0.1 * rng.normal(size=(4000, 3))
     bins = np.array(bin_of(mi.Vector3f((seen / np.linalg.norm(seen, axis=1, keepdims=True)).T))).astype(np.int64)
-    guide = Guide.learned(np.stack([np.bincount(bins, minlength=BINS), np.zeros(BINS)]).astype(np.float32))
+    guide = Guide(np.stack([np.bincount(bins, minlength=BINS), np.zeros(BINS)]).astype(np.float32))
     n = 1 << 18
     even = rng.normal(size=(n, 3)).astype(np.float32)
     even /= np.linalg.norm(even, axis=1, keepdims=True)
@@ -230,7 +238,7 @@ def test_white_furnace(tmp_path: Path) -> None:
     lattice = make_lattice(scene, light.texel_m)
     front, back = lighting.bake(scene, lattice, light, silent)
     assert (front[:, 3] == 1).all() and not back.any()
-    field = make_field(lattice, front, back)
+    field = IrradianceField(lattice, front, back)
     camera = Camera(32, 24, 14.0, 14.0, 15.5, 11.5)
     renderer = ColorRenderer(scene, BakedIntegrator(field), camera, Shutter(), 16)
     ratio = renderer.render(constant_twist(np.zeros(6)), 0.0, seed=1) / (glow / (1 - albedo))

@@ -12,7 +12,7 @@ from rendering import mi
 
 from rsgen.config.config import LightConfig
 from rsgen.device.arrays import vectors
-from rsgen.light.cache import baked_field
+from rsgen.light.bake import baked_field
 from rsgen.light.lamps import bulbs
 
 HEIGHT_M = 0.6

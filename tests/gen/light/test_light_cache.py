@@ -19,7 +19,7 @@ from lit import (
 
 from rsgen.config.config import LightConfig
 from rsgen.errors import UserError
-from rsgen.light import cache as lighting
+from rsgen.light import bake as lighting
 from rsgen.render.irradiance import IrradianceField, make_lattice
 from rsgen.scene.loading import load_scene
 

@@ -14,12 +14,12 @@ from rendering import constant_twist, dr, mi
 from rsgen.device.arrays import rows_of, vectors
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.light.caustics import gathered_caustics
 from rsgen.light.indirect import gathering
+from rsgen.light.specular import gathered_caustics
 from rsgen.light.surface_points import SamplePoints
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
-from rsgen.render.irradiance import make_field, make_lattice
+from rsgen.render.irradiance import IrradianceField, make_lattice
 
 WALL_X, LAMP_X = -0.9, -0.6
 RADIANCE = np.array([1.0, 2.0, 3.0])
@@ -119,7 +119,7 @@ def test_what_stands_behind_a_board_takes_no_light_from_it(tmp_path: Path) -> No
     for elements in ((FLOOR, board), (board,)):
         scene = scene_of(tmp_path, LAMP, wall(BLACK_LACQUER), *elements)
         lattice, front, back = bake(scene, texel_m=0.02, direct_samples=256)
-        got.append(lookup(scene, make_field(lattice, front, back), xyz, (0, 0, -1))[1].sum())
+        got.append(lookup(scene, IrradianceField(lattice, front, back), xyz, (0, 0, -1))[1].sum())
     assert got[0] == pytest.approx(got[1], rel=0.06)
 
 
@@ -154,7 +154,7 @@ def test_a_matte_board_in_lacquer_is_seen_in_it_as_a_lamp_is(tmp_path: Path, bsd
     xyz = beyond_the_lamp(3)
     points = repeated(xyz, 32)
     rays, every = 1 << 14, np.arange(len(points.position))
-    drawn = gathering(scene, make_field(lattice, lit, lit), points, every)(every, 0, rays, silent)
+    drawn = gathering(scene, IrradianceField(lattice, lit, lit), points, every)(every, 0, rays, silent)
     got = drawn.sum(axis=0)[:, 0].reshape(len(xyz), -1).mean(axis=1) / rays
     mirrored = off_lacquer(xyz) if bsdf is BLACK_LACQUER else off_satin(scene, xyz)
     ratio = got / (0.5 * mirrored)
@@ -185,7 +185,7 @@ def test_bounces_go_on_in_a_white_room_beside_a_bright_street(tmp_path: Path) ->
     scene = scene_of(tmp_path, *plates, furnace, lamp)
     lattice, front, back = bake(scene, texel_m=0.2, bounces=12, gather_rays=256, direct_samples=256)
     ways = ball.triangles_center[::20] - [0, 0, 5]
-    got = lookup(scene, make_field(lattice, front, back), np.tile([0.0, 0.0, 5.0], (len(ways), 1)), ways)[1]
+    got = lookup(scene, IrradianceField(lattice, front, back), np.tile([0.0, 0.0, 5.0], (len(ways), 1)), ways)[1]
     assert np.abs(got.mean(axis=0) / (np.pi * glow / (1 - albedo)) - 1).max() < 0.01
 
 
@@ -204,7 +204,7 @@ def test_a_lacquered_floor_in_brushed_metal_shows_what_it_mirrors(tmp_path: Path
     T_world_cam[:3, 3] = 0.8, 0, 0.15
     view = constant_twist(np.zeros(6), T_world_cam)
     camera = Camera(24, 8, 40.0, 40.0, 11.5, 8.0)
-    baked = BakedIntegrator(make_field(lattice, front, back), glossy_spp=512)
+    baked = BakedIntegrator(IrradianceField(lattice, front, back), glossy_spp=512)
     ours = ColorRenderer(scene, baked, camera, Shutter(), 512).render(view, 0.0, 1)
     path = mi.load_dict({"type": "path", "max_depth": 12})
     traced = ColorRenderer(scene, path, camera, Shutter(), 4096).render(view, 0.0, 2)

@@ -26,12 +26,11 @@ from lit import (
 
 from rsgen import srgb
 from rsgen.config.config import LightConfig
-from rsgen.light import cache as lighting
-from rsgen.light.barriers import find_covered
-from rsgen.light.interpolation import Interpolation, thin
+from rsgen.light import bake as lighting
 from rsgen.light.quality import estimated_quality
-from rsgen.light.surface_points import SamplePoints, sample_points
-from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
+from rsgen.light.sampling import Interpolation, thin
+from rsgen.light.surface_points import SamplePoints, find_covered, sample_points
+from rsgen.render.irradiance import IrradianceField, lattice_area, lattice_barycentric, make_lattice
 from rsgen.scene.meshes import surface
 
 
@@ -125,7 +124,7 @@ def test_lookup_reproduces_a_linear_function_on_both_sides(shapes: Any, spacing:
     lattice = make_lattice(shapes, spacing)
     alive = np.ones((lattice.points, 1))
     values = smooth(lattice_positions(shapes, lattice))
-    field = make_field(lattice, np.hstack([values, alive]), np.hstack([-values, alive]))
+    field = IrradianceField(lattice, np.hstack([values, alive]), np.hstack([-values, alive]))
     origin, direction = random_hits(shapes, 4000, seed=1)
     hit, got, front = lookup_side(shapes, field, origin, direction)
     assert np.abs(hit - origin).max() < 1e-4
@@ -163,7 +162,7 @@ def test_points_that_are_not_alive_do_not_count(shapes: Any) -> None:
     values = smooth(lattice_positions(shapes, lattice))
     dead = np.random.default_rng(3).random(lattice.points) < 0.3
     front = np.where(dead[:, None], 0, np.column_stack([values, np.ones(len(values))]))
-    field = make_field(lattice, front, np.zeros_like(front))
+    field = IrradianceField(lattice, front, np.zeros_like(front))
     origin, direction = random_hits(shapes, 4000, seed=2)
     hit, got, on_front = lookup_side(shapes, field, origin, direction)
     assert not got[~on_front].any()  # a back side without light is black
@@ -177,7 +176,7 @@ def test_points_that_are_not_alive_do_not_count(shapes: Any) -> None:
 def test_light_is_continuous_over_edges_that_triangles_share(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, *CORNELL)
     lattice, front, back = bake(scene, bounces=2, direct_samples=64)
-    field = make_field(lattice, front, back)
+    field = IrradianceField(lattice, front, back)
     # The floor's diagonals, whichever the rectangle has, and lines parallel to them within one triangle.
     s = np.linspace(-0.9, 0.9, 200)
     for sign in (1, -1):
@@ -193,7 +192,7 @@ def test_light_is_continuous_over_edges_that_triangles_share(tmp_path: Path) -> 
 def test_a_sheet_is_lit_on_the_side_that_faces_the_light(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, FLOOR, POINT)
     lattice, front, back = bake(scene)
-    field = make_field(lattice, front, back)
+    field = IrradianceField(lattice, front, back)
     xyz = floor_grid()
     above = lookup(scene, field, xyz + 0.01 * UP, -UP)[1]
     below = lookup(scene, field, xyz - 0.01 * UP, UP)[1]
@@ -226,7 +225,7 @@ def test_what_is_buried_does_not_darken_its_neighbours(tmp_path: Path) -> None:
     # Beside the slab the lookup extrapolates by up to a texel: 3 cm keeps the light's own fall-off below the tolerance.
     lattice, front, back = bake(scene, texel_m=0.03)
     assert (front[:, 3] == 0).sum() > 50  # the floor below the slab
-    got = lookup(scene, make_field(lattice, front, back), xyz + 0.005 * UP, -UP)[1]
+    got = lookup(scene, IrradianceField(lattice, front, back), xyz + 0.005 * UP, -UP)[1]
     d = np.array([0.3, -0.2, 0.8]) - xyz
     np.testing.assert_allclose(got[:, 0], 0.8 / np.linalg.norm(d, axis=-1) ** 3, rtol=0.06)
 
@@ -278,7 +277,7 @@ def test_light_does_not_leak_under_a_wall(tmp_path: Path, door: bool) -> None:
     scene = scene_of(tmp_path, FLOOR, wall, *lamps)
     lattice, front, back = bake(scene, texel_m=0.03)
     assert (front[:, 3] > 1).sum() > 40
-    field = make_field(lattice, front, back)
+    field = IrradianceField(lattice, front, back)
     y = np.linspace(-0.8, last, 40)
     for x0, side, power in ((-0.5, -1, 1), (0.5, 1, 100)):
         for gap in (0.003, 0.01, 0.02):
@@ -307,7 +306,7 @@ def test_a_bevel_sunk_into_a_wall_has_the_light_of_the_room(tmp_path: Path) -> N
     lattice, front, back = bake(scene, texel_m=0.03)
     y = np.linspace(-0.78, 0.78, 61)
     xyz = np.stack([np.full_like(y, 0.0007), y, np.full_like(y, 0.1)], axis=-1)
-    got = lookup(scene, make_field(lattice, front, back), xyz + 0.001 * UP, -UP)[1][:, 0]
+    got = lookup(scene, IrradianceField(lattice, front, back), xyz + 0.001 * UP, -UP)[1][:, 0]
     d = np.array([0.5, 0.1, 0.5]) - xyz
     error = np.abs(got / (0.4 / np.linalg.norm(d, axis=-1) ** 3) - 1)
     assert np.mean(error < 0.02) > 0.8
@@ -334,13 +333,13 @@ def test_the_estimate_is_the_error_that_is_there(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, FLOOR, QUAD)
     lattice, front, back = bake(scene, texel_m=0.04, direct_samples=256, target_db=50)
     xy = np.random.default_rng(5).uniform(-1, 1, (4000, 2))
-    good = estimated_quality(scene, make_field(lattice, front, back), 0.04, *from_above(xy))
+    good = estimated_quality(scene, IrradianceField(lattice, front, back), 0.04, *from_above(xy))
     assert good.psnr_db > good.at_least_db > 44
     off = np.array([1.1, 1.1, 1.1, 1.0, 1.0], np.float32)
     light = quad_factor(np.column_stack([xy, np.zeros(len(xy))]))[:, None] * [1.0, 2.0, 3.0]
     shown = 0.18 * light / np.median(light.mean(axis=1))
     square = (srgb.encode(np.clip(1.1 * shown, 0, 1)) - srgb.encode(np.clip(shown, 0, 1))) ** 2
-    poor = estimated_quality(scene, make_field(lattice, front * off, back * off), 0.04, *from_above(xy))
+    poor = estimated_quality(scene, IrradianceField(lattice, front * off, back * off), 0.04, *from_above(xy))
     assert poor.psnr_db == pytest.approx(-10 * np.log10(square.mean()), abs=0.3)
     sure = square.mean() + 2 * square.mean(axis=1).std() / np.sqrt(len(xy))
     assert poor.at_least_db == pytest.approx(-10 * np.log10(sure), abs=0.3)
@@ -352,7 +351,7 @@ def test_the_estimate_counts_what_is_seen(tmp_path: Path) -> None:
     lattice, front, back = bake(scene, texel_m=0.04, direct_samples=256, target_db=50)
     left = lattice_positions(scene, lattice)[:, 0] < 0
     front[left, :3] *= 1.3
-    field = make_field(lattice, front, back)
+    field = IrradianceField(lattice, front, back)
     xy = np.random.default_rng(6).uniform(-1, 1, (1000, 2))
     for x, right in ((-0.05 - abs(xy[:, 0] * 0.9), False), (0.05 + abs(xy[:, 0] * 0.9), True)):
         quality = estimated_quality(scene, field, 0.04, *from_above(np.column_stack([x, xy[:, 1]])))

@@ -19,9 +19,8 @@ from rsgen.image_codecs import encode_exr
 from rsgen.light.quality import estimated_quality
 from rsgen.light.sampling import in_channels
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.images import ColorRenderer
-from rsgen.render.irradiance import make_field
-from rsgen.render.pixel_samples import PixelSamples
+from rsgen.render.images import ColorRenderer, PixelSamples
+from rsgen.render.irradiance import IrradianceField
 
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -59,7 +58,7 @@ def test_what_is_beneath_lacquer_is_lit_by_what_gets_in(tmp_path: Path, kind: st
         <rgb name="intensity" value="20"/></emitter>"""
     scene = scene_of(tmp_path, floor, lamp)
     camera = Camera(8, 8, 40.0, 40.0, 3.5, 3.5)
-    baked = BakedIntegrator(make_field(*bake(scene, direct_samples=4)))
+    baked = BakedIntegrator(IrradianceField(*bake(scene, direct_samples=4)))
     view = from_above(0.0, 0.02, 0.8)
     ours = ColorRenderer(scene, baked, camera, Shutter(), 64).render(view, 0.0, 1).mean(axis=(0, 1))
     path = mi.load_dict({"type": "path", "max_depth": 3})
@@ -76,7 +75,7 @@ def test_the_estimate_knows_of_lacquer(tmp_path: Path) -> None:
     scene = scene_of(tmp_path, floor, lamp)
     xy = np.random.default_rng(1).uniform(-0.9, 0.9, (500, 2))
     view = np.column_stack([xy, np.full(500, 0.3)]), np.tile([0.0, 0.0, -1.0], (500, 1))
-    field = make_field(*bake(scene, texel_m=0.1, direct_samples=4))
+    field = IrradianceField(*bake(scene, texel_m=0.1, direct_samples=4))
     assert estimated_quality(scene, field, 0.1, *view).psnr_db > 40
 
 
@@ -95,7 +94,7 @@ def test_lacquer_in_lacquer_shows_the_sky(tmp_path: Path) -> None:
     T_world_cam[:3, :3], T_world_cam[:3, 3] = axes.T, (-0.4, 0.0, 0.5)
     camera = Camera(8, 8, 120.0, 120.0, 3.5, 3.5)
     view = constant_twist(np.zeros(6), T_world_cam)
-    baked = BakedIntegrator(make_field(*bake(scene, direct_samples=64)), glossy_spp=1024)
+    baked = BakedIntegrator(IrradianceField(*bake(scene, direct_samples=64)), glossy_spp=1024)
     ours = ColorRenderer(scene, baked, camera, Shutter(), 1024).render(view, 0.0, 1).mean(axis=(0, 1))
     path = mi.load_dict({"type": "path", "max_depth": 8})
     traced = ColorRenderer(scene, path, camera, Shutter(), 1024).render(view, 0.0, 2).mean(axis=(0, 1))
@@ -111,7 +110,7 @@ def test_samples_of_a_pixel_spread_evenly_over_a_lobe(tmp_path: Path) -> None:
     scene = scene_of(
         tmp_path, floor, wall, '<emitter type="point"><point name="position" x="0" y="0" z="2"/></emitter>'
     )
-    baked = BakedIntegrator(make_field(*bake(scene, texel_m=0.1, direct_samples=4)))
+    baked = BakedIntegrator(IrradianceField(*bake(scene, texel_m=0.1, direct_samples=4)))
     pixels, spp = 2000, 16
     number = np.tile(np.arange(spp), pixels)
     ray = mi.Ray3f(mi.Point3f(0, 0, 1), dr.normalize(mi.Vector3f(0.2, 0, -1)))
@@ -138,7 +137,7 @@ def test_rough_metal_seen_from_behind_in_a_glossy_floor_is_dark_and_a_number(tmp
     (tmp_path / "sky.exr").write_bytes(encode_exr(np.ones((4, 8, 3), np.float32), ("R", "G", "B")))
     sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
     scene = scene_of(tmp_path, floor, away, sky)
-    baked = BakedIntegrator(make_field(*bake(scene, texel_m=1.0, direct_samples=4)))
+    baked = BakedIntegrator(IrradianceField(*bake(scene, texel_m=1.0, direct_samples=4)))
     camera = Camera(16, 12, 8.0, 8.0, 7.5, 5.5)
     image = ColorRenderer(scene, baked, camera, Shutter(), 16).render(from_above(0.0, 0.0, 0.4), 0.0, 1)
     assert np.isfinite(image).all() and image[5:7, 7:9].max() < 0.3 * image.max()

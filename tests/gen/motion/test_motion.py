@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from rsgen.config.motion import MotionConfig, Waypoint
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.motion.clearance import check_clearance, clearance, nearest_surface, plan_tour
 from rsgen.motion.fit import fit_spline
-from rsgen.motion.make import band_noise, make_motion
-from rsgen.motion.paths import TourCurve, look_at, make_path, travel, window
+from rsgen.motion.free_space import check_clearance, clearance, nearest_surface, plan_tour
+from rsgen.motion.make import TourCurve, band_noise, look_at, make_motion, make_path, travel, window
 from rsgen.motion.statistics import TABLE_1, motion_statistics, stats_table
 from rsgen.sequence.trajectory import Trajectory
 

@@ -13,8 +13,8 @@ import yaml
 
 from rsgen.config.config import ColorConfig, DepthConfig
 from rsgen.config.motion import MotionConfig
-from rsgen.motion.clearance import nearest_surface
 from rsgen.motion.fit import FitResult, fit_spline
+from rsgen.motion.free_space import nearest_surface
 from rsgen.motion.make import make_motion
 from rsgen.motion.statistics import TABLE_1, motion_statistics
 from rsgen.sequence.trajectory import Trajectory

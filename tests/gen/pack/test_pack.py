@@ -16,9 +16,9 @@ from rsgen.config.config import Config, load_config
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
-from rsgen.motion.stretch import Drawn, draw_stretch
-from rsgen.pack.draw import PackOptions, camera_spline
-from rsgen.pack.pairs import T_depth_color, flo_bytes, mark_file, pdepth_text
+from rsgen.motion.stretch import Drawn, along, draw_stretch
+from rsgen.pack.draw import PackOptions
+from rsgen.pack.make import flo_bytes, mark_file, pdepth_text
 from rsgen.produce.parts import load_motion
 
 SPAN = [(2.0, 12.0), (0.0, 1.0)]
@@ -49,7 +49,7 @@ def test_a_draw_depends_on_seed_and_index_alone_and_keeps_to_its_ranges() -> Non
 def test_the_cameras_curve_is_the_bodys_faster_turned_and_from_the_lens() -> None:
     body, T_depth_color = spline(), se3.exp(np.array([0.02, 0.01, -0.03, 0.1, 0.0, 0.2]))
     drawn = Drawn(0, 0.02, 0.0, 0.4, 2.5, (0.1, -0.3, 0.05), 1)
-    camera = camera_spline(body, drawn, T_depth_color)
+    camera = along(body, drawn.start_s, drawn.speed, drawn.turn, T_depth_color)
     t = np.linspace(0.0, 0.25, 7)
     T_turn = np.eye(4)
     T_turn[:3, :3] = so3.exp(np.array(drawn.turn))
@@ -126,7 +126,8 @@ def drawn_in(folder: Path, config: Config) -> tuple[Drawn, Spline]:
     about = json.loads((folder / "sequence.json").read_text())
     names = ("readout_s", "exposure_s", "start_s", "speed", "seed")
     drawn = Drawn(config=0, turn=tuple(about["turn"]), **{name: about[name] for name in names})
-    return drawn, camera_spline(load_motion(config).spline, drawn, T_depth_color(config))
+    T_depth_color = se3.inverse(np.array(config.T_color_depth, float))
+    return drawn, along(load_motion(config).spline, drawn.start_s, drawn.speed, drawn.turn, T_depth_color)
 
 
 def read_flow(path: Path) -> np.ndarray:
@@ -177,15 +178,8 @@ def test_masks_say_which_global_pixels_the_rolling_image_holds(packed: Path) -> 
 
 
 def test_the_gyroscope_reads_what_the_camera_turned(packed: Path, small_config: Path) -> None:
-    about = json.loads((packed / "000000/sequence.json").read_text())
     table = np.loadtxt(packed / "000000/imu.csv", delimiter=",", comments="#")
-    from rsgen.produce.parts import load_motion
-
-    config = load_config(small_config)
-    fields = {name: about[name] for name in ("config", "readout_s", "exposure_s", "start_s", "speed", "seed")}
-    drawn = Drawn(**fields | {"config": 0}, turn=tuple(about["turn"]))
-    T_depth_color = se3.inverse(np.array(config.T_color_depth, float))
-    camera = camera_spline(load_motion(config).spline, drawn, T_depth_color)
+    _, camera = drawn_in(packed / "000000", load_config(small_config))
     R = camera.pose(1e-9 * table[[0, -1], 0])[:, :3, :3]
     whole = np.eye(3)
     for rate in table[:-1, 1:4] / 2 + table[1:, 1:4] / 2:
@@ -225,12 +219,8 @@ def test_depth_puts_points_where_the_flow_does(packed: Path, small_config: Path,
     assert extra == {"0000_rs.pdepth", "0001_rs.pdepth"}
     assert (folder / "0001_rs.png").read_bytes() == (packed / "000000/0001_rs.png").read_bytes()
 
-    from rsgen.produce.parts import load_motion
-
-    about, config = json.loads((folder / "sequence.json").read_text()), load_config(small_config)
-    names = ("readout_s", "exposure_s", "start_s", "speed", "seed")
-    drawn = Drawn(config=0, turn=tuple(about["turn"]), **{name: about[name] for name in names})
-    spline = camera_spline(load_motion(config).spline, drawn, se3.inverse(np.array(config.T_color_depth, float)))
+    config = load_config(small_config)
+    drawn, spline = drawn_in(folder, config)
     color = config.color.model_copy(update={"readout_s": drawn.readout_s, "exposure_s": drawn.exposure_s})
     camera, shutter, stamp = color.camera, color.shutter, 1 / color.rate_hz
     uv, z = camera.pixel_grid(), np.loadtxt(folder / "0001_rs.pdepth")

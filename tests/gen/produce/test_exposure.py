@@ -13,7 +13,7 @@ from lit import scene_of, write_scene
 
 from rsgen.cli.main import main
 from rsgen.geometry.camera import Camera
-from rsgen.motion.floor_plan import Cast
+from rsgen.motion.free_space import Cast
 from rsgen.produce.views import (
     MOST_CLIPPED,
     Exposure,

@@ -17,8 +17,8 @@ from rsgen.cli.main import main
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sequence.images import Rig
-from rsgen.sequence.labels import Thing, boxes_text, class_of, labels_yaml, read_labels
 from rsgen.sequence.reader import read_sequence
+from rsgen.sequence.truth_files import Thing, boxes_text, class_of, labels_yaml, read_labels
 
 BALL = {
     "name": "red ball".replace(" ", "_"),

@@ -104,7 +104,7 @@ def test_light_that_is_baked_is_told(cell: Path) -> None:
     from rsgen.device.backend import mitsuba
 
     mitsuba()
-    from rsgen.light.cache import cache_folder, cache_key
+    from rsgen.light.bake import cache_folder, cache_key
     from rsgen.scene.loading import content_hash
 
     file = library.build_variant("cell", None, cell)

@@ -20,7 +20,7 @@ from rsgen.config.config import Config, LightConfig, load_config
 from rsgen.console.configs import config_file
 from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
-from rsgen.motion.clearance import check_clearance
+from rsgen.motion.free_space import check_clearance
 from rsgen.motion.statistics import motion_statistics
 from rsgen.produce.parts import TrueMotion, load_motion
 from rsgen.produce.suggest import Suggestion, Wish, suggest_tour

@@ -16,13 +16,12 @@ from shutter_reference import line_window
 from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
 from rsgen.config.config import load_config
-from rsgen.config.rig import DotsConfig, StereoConfig
+from rsgen.config.rig import StereoConfig
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.geometry import se3
-from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
-from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
-from rsgen.sensors.stereo import dot_pattern, stereo_depth
+from rsgen.produce.generate import render_block
+from rsgen.sensors.depth import stereo_depth
 from rsgen.sequence.images import Rig, Sequence
 from rsgen.sequence.reader import read_rig, read_sequence
 from rstrack.data.dataset import open_dataset
@@ -155,13 +154,8 @@ def test_the_tracker_opens_two_cameras_by_name(root: Path) -> None:
             open_dataset(Path(f"{root}{words}"))
 
 
-def test_a_worker_renders_the_same_bytes(config: Path, root: Path) -> None:
-    loaded = load_config(config)
-    motion = load_motion(loaded)
-    recipe = SequenceRecipe(
-        loaded, motion.spline, sequence_stamps(loaded, motion), engine_versions(loaded.backend), input_hashes(loaded)
-    )
-    files = render_block(RenderJob(recipe, ((1, "matched"), (2, "left"))), no_progress)
+def test_a_worker_renders_the_same_bytes(config: Path, root: Path, tmp_path: Path) -> None:
+    files = render_block(tiny.render_job(load_config(config), tmp_path, (1, "matched"), (2, "left")), no_progress)
     assert {"matched/000001.png", "left/000002.png"} <= set(files)
     assert all((root / name).read_bytes() == data for name, data in files.items())
 
@@ -281,19 +275,6 @@ def test_stereo_depth_of_a_wall_is_its_distance_and_what_one_eye_sees_has_none()
     assert np.median(inside) == pytest.approx(2.0, rel=0.01) and (inside > 0).mean() > 0.95
     assert (z[:, : int(shift)] == 0).mean() > 0.8  # left of what the right camera sees
     assert (stereo_depth(left, np.full_like(right, 128), 25.0, StereoConfig(left="a", right="b")) > 0).mean() < 0.2
-
-
-def test_one_dot_is_where_its_ray_says_and_as_wide() -> None:
-    config = DotsConfig(count=1, field_deg=(20.0, 20.0), dot_deg=1.0)
-    half = np.tan(np.deg2rad(config.field_deg) / 2)
-    pattern = dot_pattern(config, half, seed=3)
-    place = np.random.default_rng([0x646F7473, 3]).random(2)
-    y, x = np.unravel_index(int(pattern.argmax()), pattern.shape)
-    np.testing.assert_allclose([x + 0.5, y + 0.5], place * np.array(pattern.shape[::-1]), atol=1.0)
-    assert 0.5 < pattern.max() <= 1
-    wide = (pattern > 0.5 * pattern.max()).sum() * np.prod(2 * half) / pattern.size  # its area at half height
-    assert wide == pytest.approx(np.pi / 4 * np.deg2rad(1.0) ** 2, rel=0.3)
-    np.testing.assert_array_equal(pattern, dot_pattern(config, half, seed=3))
 
 
 def test_a_damaged_rig_is_one_line(root: Path, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.image_codecs import encode_exr, read_exr
 from rsgen.light.probes import gathered_light
 from rsgen.produce.parts import load_motion, open_frames
-from rsgen.render.irradiance import IrradianceField, make_field, make_lattice
+from rsgen.render.irradiance import IrradianceField, Lattice, make_lattice
 from rsgen.scene.moving_objects import MovingObject, ObjectsInFrame, covered, harmonics, irradiance_coefficients
 from rsgen.scene.object_meshes import load_object
 from rsgen.sequence.reader import read_sequence
@@ -46,9 +46,8 @@ def test_a_ball_covers_its_form_factor(distance: float, tilt: float) -> None:
 def test_light_from_all_sides_is_even_and_light_from_above_is_above() -> None:
     """Under an even sky, E = pi L whichever way a surface faces; half a sky lights as the cosine has it."""
     sky = mi.load_dict({"type": "scene", "sky": {"type": "constant", "radiance": 0.7}})
-    dark = IrradianceField(
-        mi.Int32([-1] * 64), mi.UInt32([0] * 64), mi.UInt32([0, 1]), mi.Float([0] * 16), mi.Float([1] * 4), 0
-    )
+    one = Lattice(np.array([0]), np.array([[1, 1]]), np.array([0]), np.full(64, -1), np.zeros(64, bool), points=4)
+    dark = IrradianceField(one, *np.zeros((2, 4, 5), np.float32))
     c = gathered_light(sky, dark, np.array([[0.0, 0, 0], [3, 1, 2]]))
     for n in np.eye(3):
         e = np.array(harmonics(n)) @ c[0]
@@ -68,7 +67,7 @@ def test_light_off_walls_is_what_they_are_lit_by_and_reflect() -> None:
     box = mi.load_dict({"type": "scene", "box": {"type": "cube", "bsdf": paper}})
     lattice = make_lattice(box, 0.5)
     lit = np.tile(np.array([3.0, 2.0, 1.0, 1.0], np.float32), (lattice.points, 1))
-    c = gathered_light(box, make_field(lattice, lit, lit), np.array([[0.0, 0, 0], [0.3, -0.2, 0.5]]))
+    c = gathered_light(box, IrradianceField(lattice, lit, lit), np.array([[0.0, 0, 0], [0.3, -0.2, 0.5]]))
     for n in np.concatenate([np.eye(3), -np.eye(3)]):
         np.testing.assert_allclose(np.array(harmonics(n)) @ c, np.tile([1.2, 0.8, 0.4], (2, 1)), rtol=0.01)
 

@@ -14,9 +14,8 @@ from scipy.stats import qmc
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
-from rsgen.render.images import ColorRenderer
-from rsgen.render.irradiance import make_field
-from rsgen.render.pixel_samples import PixelSamples
+from rsgen.render.images import ColorRenderer, PixelSamples
+from rsgen.render.irradiance import IrradianceField
 
 LOOK_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 LOOK_DOWN[:3, 3] = 0.1, 0.0, 1.4
@@ -107,7 +106,7 @@ def _lit(folder: Path, color: str) -> tuple[Any, BakedIntegrator]:
         for x in (-0.5, 0.6)
     ]
     scene = scene_of(folder, floor, *lamps)
-    return scene, BakedIntegrator(make_field(*bake(scene, texel_m=0.1, direct_samples=4)), glossy_spp=2)
+    return scene, BakedIntegrator(IrradianceField(*bake(scene, texel_m=0.1, direct_samples=4)), glossy_spp=2)
 
 
 def _renderer(lit: tuple[Any, BakedIntegrator]) -> ColorRenderer:

@@ -15,7 +15,7 @@ from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.render.baked import BakedIntegrator
 from rsgen.render.images import ColorRenderer
-from rsgen.render.irradiance import make_field
+from rsgen.render.irradiance import IrradianceField
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
 BEFORE, BEHIND = 40.0, 0.3  # radiance of what the pane shows as a mirror, and of what is seen through it
@@ -40,7 +40,7 @@ def test_a_bright_reflection_in_a_pane_is_no_speckle(tmp_path: Path) -> None:
     pane = f"""<shape type="rectangle"><transform name="to_world"><scale value="20"/><translate z="1"/></transform>
         {GLASS.format("thindielectric")}</shape>"""
     scene = scene_of(tmp_path, *WALLS, pane)
-    image = seen(scene, BakedIntegrator(make_field(*bake(scene, texel_m=2.0, direct_samples=4))), 16, 1)
+    image = seen(scene, BakedIntegrator(IrradianceField(*bake(scene, texel_m=2.0, direct_samples=4))), 16, 1)
     ray = CAMERA.unproject(CAMERA.pixel_grid())
     c = 1 / np.linalg.norm(ray, axis=-1)
     refracted = np.sqrt(1 - (1 - c**2) / 1.5**2)
@@ -57,7 +57,7 @@ def test_thick_glass_is_as_the_path_tracer_has_it(kind: str, tmp_path: Path) -> 
     block = f"""<shape type="cube"><transform name="to_world"><scale x="0.25" y="0.2" z="0.3"/><rotate y="1" x="0.4"
         angle="35"/><translate z="1.2"/></transform>{GLASS.format(kind)}</shape>"""
     scene = scene_of(tmp_path, *WALLS, block)
-    ours = BakedIntegrator(make_field(*bake(scene, texel_m=2.0, direct_samples=4)), glossy_spp=512)
+    ours = BakedIntegrator(IrradianceField(*bake(scene, texel_m=2.0, direct_samples=4)), glossy_spp=512)
     path = mi.load_dict({"type": "path", "max_depth": 18})
     baked, traced = (np.mean([seen(scene, i, 512, k) for k in range(2)], axis=0) for i in (ours, path))
     assert traced[8:16, 12:20].min() > 5 * BEHIND  # the block is in the middle, and both walls in it

@@ -15,7 +15,7 @@ from room_frames import MOTION, STAMP, color, z_spread
 
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.render.images import DepthRenderer, global_shutter
+from rsgen.render.images import DepthRenderer
 from rsgen.scene.loading import load_scene
 from rsgen.scene.meshes import ply_bytes
 
@@ -46,11 +46,6 @@ def test_a_moving_camera_without_readout_stands_still(scene: Any) -> None:
     np.testing.assert_array_equal(picture.render(spline.pose, STAMP, 2), picture.render(still, STAMP, 2))
     rolling = DepthRenderer(scene, CAMERA, Shutter(0.028)).render(spline.pose, STAMP)
     assert np.mean(rolling != depth.render(still, STAMP)) > 0.9  # or this test would pass for any renderer
-
-
-def test_global_shutter_keeps_all_but_the_readout() -> None:
-    shutter = Shutter(0.028, 0.01, "right-left")
-    assert global_shutter(shutter) == Shutter(0.0, 0.01, "right-left")
 
 
 # --- closed forms

@@ -16,8 +16,7 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.image_codecs import encode_exr
 from rsgen.render.images import ColorRenderer, DepthRenderer
 from rsgen.scene import placement
-from rsgen.scene.board import Board
-from rsgen.scene.loading import content_hash, load_scene
+from rsgen.scene.loading import Board, content_hash, load_scene
 from rsgen.scene.meshes import mesh_arrays
 from rsgen.scene.placement import SceneOptions, camera_up
 

@@ -20,7 +20,7 @@ from rsgen.errors import UserError
 from rsgen.light.bake import bake
 from rsgen.produce.parts import make_integrator
 from rsgen.render import irradiance
-from rsgen.render.irradiance import lattice_area, lattice_barycentric, make_field, make_lattice
+from rsgen.render.irradiance import IrradianceField, lattice_area, lattice_barycentric, make_lattice
 from rsgen.scene.loading import load_scene
 from rsgen.scene.meshes import ply_bytes, surface
 from rsgen.scene.xml_scene import messages_to_log
@@ -201,7 +201,7 @@ def test_where_triangles_are_too_many_small_ones_have_one_sample(
     assert every.points > 2 * few.points and few.points <= 40_000
     triangles = [np.bincount(lattice_barycentric(k)[0], lattice_area(scene, k)) for k in (few, every)]
     np.testing.assert_allclose(*triangles)
-    fields = [make_field(k, *bake(scene, k, light, lambda *_: None)) for k in (few, every)]
+    fields = [IrradianceField(k, *bake(scene, k, light, lambda *_: None)) for k in (few, every)]
     ray = rays_at(np.array([0.0, 0.0, 0.5]), 0.3)
     pi = scene.ray_intersect_preliminary(ray, coherent=False)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All)

@@ -16,8 +16,7 @@ from rsgen.config.config import load_config
 from rsgen.console.progress import no_progress
 from rsgen.errors import UserError
 from rsgen.produce.camera_sources import setting_of
-from rsgen.produce.distribute import RenderJob, SequenceRecipe, render_block
-from rsgen.produce.parts import engine_versions, input_hashes, load_motion, sequence_stamps
+from rsgen.produce.generate import render_block
 from rsgen.sensors.color import Reading, Setting, adapt, apply_color_noise, apply_setting, reading
 from rsgen.sequence.reader import read_sequence
 
@@ -166,15 +165,10 @@ def test_resuming_gives_the_same_bytes(config: Path, whole: Path, tmp_path: Path
     assert tiny.digests(tmp_path / "seq") == tiny.digests(whole)
 
 
-def test_a_worker_takes_frames_as_the_whole_did(config: Path, whole: Path) -> None:
+def test_a_worker_takes_frames_as_the_whole_did(config: Path, whole: Path, tmp_path: Path) -> None:
     loaded = load_config(config)
-    motion = load_motion(loaded)
-    stamps = sequence_stamps(loaded, motion)
     table = read_sequence(whole).streams["color"].table
     settings = [setting_of(loaded.color, table, k) for k in range(12)]
-    plan = SequenceRecipe(
-        loaded, motion.spline, stamps, engine_versions(loaded.backend), input_hashes(loaded),
-        {"color": tuple(s for s in settings if s is not None)},
-    )  # fmt: skip
-    files = render_block(RenderJob(plan, ((10, "color"),)), no_progress)
+    job = tiny.render_job(loaded, tmp_path, (10, "color"), color=[s for s in settings if s is not None])
+    files = render_block(job, no_progress)
     assert len(files) == 5 and all((whole / name).read_bytes() == data for name, data in files.items())

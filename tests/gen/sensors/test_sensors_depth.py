@@ -17,8 +17,8 @@ from rsgen.geometry.shutter import Shutter
 from rsgen.render.images import DepthRenderer
 from rsgen.sensors import depth
 from rsgen.sensors.depth import apply_depth_noise
+from rsgen.sensors.projectors import Projector
 from rsgen.sensors.seed import noise_generator
-from rsgen.sensors.shadow import Projector
 
 CAMERA = Camera(320, 240, 285.0, 285.0, 159.5, 119.5)
 RADTAN = Camera(320, 240, 285.0, 283.0, 163.0, 117.0, "radtan", (-0.15, 0.04, 0.003, -0.002, -0.01))

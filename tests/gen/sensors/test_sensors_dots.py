@@ -12,7 +12,7 @@ from rsgen.array_types import Float32Array
 from rsgen.config.rig import DotsConfig
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.sensors.dots import DotProjector
+from rsgen.sensors.projectors import DotProjector, dot_pattern
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 PLACE = np.array([0.06, -0.02, 0.01])
@@ -60,3 +60,16 @@ def test_what_stands_in_the_way_of_the_projector_takes_its_dot_off_the_wall() ->
     free, hidden = lit(wall=plate(z)), lit(wall=plate(z), screen=plate(near, 0.02, x, y))
     assert free[wall[1], wall[0]] > 0.1
     assert hidden[wall[1], wall[0]] == 0 and hidden.max() > free.max()  # it is on the screen, which is nearer
+
+
+def test_one_dot_is_where_its_ray_says_and_as_wide() -> None:
+    config = DotsConfig(count=1, field_deg=(20.0, 20.0), dot_deg=1.0)
+    half = np.tan(np.deg2rad(config.field_deg) / 2)
+    pattern = dot_pattern(config, half, seed=3)
+    place = np.random.default_rng([0x646F7473, 3]).random(2)
+    y, x = np.unravel_index(int(pattern.argmax()), pattern.shape)
+    np.testing.assert_allclose([x + 0.5, y + 0.5], place * np.array(pattern.shape[::-1]), atol=1.0)
+    assert 0.5 < pattern.max() <= 1
+    wide = (pattern > 0.5 * pattern.max()).sum() * np.prod(2 * half) / pattern.size  # its area at half height
+    assert wide == pytest.approx(np.pi / 4 * np.deg2rad(1.0) ** 2, rel=0.3)
+    np.testing.assert_array_equal(pattern, dot_pattern(config, half, seed=3))

@@ -15,8 +15,8 @@ from rsgen.check.verify import verify_sequence
 from rsgen.cli.main import main
 from rsgen.config.config import Config, load_config
 from rsgen.config.faults import FaultsConfig, ImuFaults, StreamFaults
-from rsgen.config.imu import ImuConfig
 from rsgen.config.presets import _IMU_FAULTS, _IMU_PRESETS
+from rsgen.config.sections import ImuConfig
 from rsgen.geometry import se3
 from rsgen.sensors.imu import exact_imu, imu_csv, simulate_imu
 from rsgen.sensors.reports import deliver

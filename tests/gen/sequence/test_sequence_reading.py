@@ -15,8 +15,7 @@ import yaml
 
 from rsgen.errors import UserError
 from rsgen.files import encode_yaml
-from rsgen.sequence.info import sequence_info
-from rsgen.sequence.reader import read_sequence
+from rsgen.sequence.reader import read_sequence, sequence_info
 
 FRAMES = 4
 

@@ -20,7 +20,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.aprilgrid import AprilGrid
 from rsgen.geometry.shutter import Shutter, project_rolling
 from rsgen.produce.parts import load_scene, scene_hash, surfaces_hash
-from rsgen.scene.board import Board, drawing, surface
+from rsgen.scene.loading import Board, board_drawing, board_surface
 from rsgen.scene.meshes import mesh_arrays
 from rsgen.sequence.images import Sequence
 from rsgen.sequence.reader import read_sequence
@@ -116,7 +116,7 @@ def test_verify_checks_the_corners(sequence: Sequence) -> None:
 
 
 def test_the_drawing_is_kalibrs() -> None:
-    image = drawing(AprilGrid(2, 2, 0.1, 0.25))
+    image = board_drawing(AprilGrid(2, 2, 0.1, 0.25))
     assert image.shape == (2 * 100 + 5 * 25, 2 * 100 + 5 * 25)
     black = image < 128
     for tag, code in enumerate(CODES):
@@ -134,7 +134,7 @@ def test_the_drawing_is_kalibrs() -> None:
 
 def test_the_board_faces_its_z_axis() -> None:
     T = np.array(T_WORLD_TARGET, float)
-    vertices, faces, normals, _ = surface(Board(AprilGrid(3, 4, 0.2, 0.3), T))
+    vertices, faces, normals, _ = board_surface(Board(AprilGrid(3, 4, 0.2, 0.3), T))
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     np.testing.assert_allclose(np.cross(b - a, c - a) @ T[:3, 2], np.prod([4 * 0.2 + 7 * 0.06, 3 * 0.2 + 6 * 0.06]))
     np.testing.assert_array_equal(normals, np.tile(T[:3, 2], (4, 1)))

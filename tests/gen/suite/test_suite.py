@@ -25,8 +25,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.spline import Spline
 from rsgen.image_codecs import encode_png
 from rsgen.produce.generate import render_sequence
-from rsgen.suite.definition import Definition, read_definition, suites_folder
-from rsgen.suite.listing import estimate
+from rsgen.suite.definition import Definition, estimate, read_definition, suites_folder
 from rsgen.suite.manifest import compare, record_files
 
 ROOT = Path(__file__).parents[3]

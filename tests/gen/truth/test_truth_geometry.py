@@ -13,8 +13,7 @@ from shutter_reference import line_window
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 from truth_frames import GEOMETRY, NEXT, SPLINE, STAMP, T_CAM_BODY, bilinear, motion, render
 
-from rsgen.device.lens import Lens
-from rsgen.device.pose_table import PoseTable
+from rsgen.device.lens import Lens, PoseTable
 from rsgen.device.projection import MovingCamera
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from loop_room import FRAMES, OPTIONS, make_dataset, to_and_fro
 
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
@@ -25,8 +25,7 @@ from rstrack.data.estimate import Estimate, read_estimate
 from rstrack.data.imu.description import PHONE
 from rstrack.data.imu.recording import ImuRecording, ReadImu
 from rstrack.metrics.association import truth_of
-from rstrack.metrics.run_evaluate import add_errors
-from rstrack.metrics.tracked import load_run
+from rstrack.metrics.run_evaluate import add_errors, load_run
 from rstrack.options import Options
 from rstrack.report.build import write_report
 from rstrack.tracking.runs import refining

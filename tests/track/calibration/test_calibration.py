@@ -20,13 +20,14 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.calibration import run as calibration_run
 from rstrack.calibration import solve as calibration_solve
-from rstrack.calibration.pairs.terms import pair_terms
+from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.trust import trust_in
 from rstrack.calibration.parameters import (
     COUNT,
     DRIFT,
     LENSES,
     USEFUL,
+    free_of,
 )
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.start import load_window
@@ -105,7 +106,7 @@ def test_a_bare_wall_is_told_from_a_room(shaken: Dataset, tmp_path: Path, monkey
     trusts = []
     for dataset in (shaken, bare):
         noisy = replace(dataset, images=NoisyImages(dataset.images, 1.2e-3, 0.01, 1))
-        terms, p = pair_terms(engine("llvm"), noisy), parameters_of(noisy)
+        terms, p = PairTerms(engine("llvm"), noisy, free_of(())), parameters_of(noisy)
         assert dataset.truth is not None
         part = load_window(terms, noisy, range(10, 24), dataset.truth, p, OPTIONS)
         for _ in range(3):

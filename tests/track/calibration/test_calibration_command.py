@@ -12,7 +12,6 @@ import pytest
 from shaken_recording import FRAMES, OPTIONS, PACE, RATE_HZ, READOUT_S, RESIDUALS, SHORT, recording, shaking, told
 
 from rstrack.calibration import run as calibration_run
-from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.devices import Device, PublishedShutter
 from rstrack.calibration.parameters import (
     COUNT,
@@ -22,7 +21,7 @@ from rstrack.calibration.parameters import (
     PRIOR,
     changed,
 )
-from rstrack.calibration.record import read_record
+from rstrack.calibration.record import camera_file_of, read_record
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.run import calibrate, parameters_of
 from rstrack.calibration.solve import Solution

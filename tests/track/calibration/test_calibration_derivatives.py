@@ -22,7 +22,7 @@ from rstrack.calibration.figures import extrapolated, residuals_at, residuals_no
 from rstrack.calibration.pairs import window as pairs_window
 from rstrack.calibration.pairs.images import ImageTiming, lines_of
 from rstrack.calibration.pairs.optics import camera_table, moves, traced
-from rstrack.calibration.pairs.terms import pair_terms
+from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.parameters import (
     COUNT,
     DRIFT,
@@ -110,7 +110,7 @@ def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(
 ) -> None:
     monkeypatch.setattr(pairs_window, "_APART", (4,))
     lensed = bent(shaken)
-    terms, p = pair_terms(engine("llvm"), lensed, np.ones(COUNT, bool)), parameters_of(lensed)
+    terms, p = PairTerms(engine("llvm"), lensed, np.ones(COUNT, bool)), parameters_of(lensed)
     assert shaken.truth is not None
     window = load_window(terms, lensed, range(4, 15), shaken.truth, p, OPTIONS)
     for _ in range(4):
@@ -130,7 +130,7 @@ def test_the_gradient_changes_along_every_parameter_as_the_normal_equations_say(
 
 def test_scipy_finds_the_same_offset_by_the_cost_alone(shaken: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pairs_window, "_APART", (5,))
-    terms, p = pair_terms(engine("llvm"), shaken), parameters_of(shaken)
+    terms, p = PairTerms(engine("llvm"), shaken, free_of(())), parameters_of(shaken)
     assert shaken.truth is not None
     windows = [load_window(terms, shaken, range(4, 20), shaken.truth, p, OPTIONS)]
     ours = solve(windows, terms, p, np.arange(COUNT) == 2, (0,))
@@ -223,7 +223,7 @@ def test_too_little_to_go_by_is_said_in_one_line(shaken: Dataset) -> None:
 
 def test_looking_at_residuals_leaves_windows_as_they_are(shaken: Dataset) -> None:
     noisy = replace(shaken, images=NoisyImages(shaken.images, 2e-3, 0.02, 7))
-    terms, p = pair_terms(engine("llvm"), noisy), parameters_of(noisy)
+    terms, p = PairTerms(engine("llvm"), noisy, free_of(())), parameters_of(noisy)
     assert noisy.truth is not None
     seen, other = (load_window(terms, noisy, range(4, 20), noisy.truth, p, OPTIONS) for _ in range(2))
     before = seen.sigma, seen.brightness.copy(), seen.spline.control_points.copy()
@@ -286,7 +286,7 @@ def test_a_spline_like_another_passes_through_its_poses() -> None:
 
 
 def test_known_values_draw_a_solution_by_as_much_as_they_weigh(shaken: Dataset) -> None:
-    terms, start, free = pair_terms(engine("llvm"), shaken), parameters_of(shaken), free_of(("readout",))
+    terms, start, free = PairTerms(engine("llvm"), shaken, free_of(())), parameters_of(shaken), free_of(("readout",))
     off = replace(start, color_readout_s=start.color_readout_s + 5e-4)
     assert shaken.truth is not None
     windows = [load_window(terms, shaken, range(4, 20), shaken.truth, start, OPTIONS)]

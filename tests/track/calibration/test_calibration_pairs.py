@@ -15,11 +15,10 @@ from rstrack.alignment.block_sums import BlockSums
 from rstrack.alignment.normal_equations import eliminate
 from rstrack.alignment.weights import START_INTENSITY
 from rstrack.calibration.pairs import kernels
-from rstrack.calibration.pairs.chain import PairSums, add_system, without_brightness
 from rstrack.calibration.pairs.images import ACROSS, LinePoses, lines_of
-from rstrack.calibration.pairs.terms import PairTerms, pair_terms
-from rstrack.calibration.pairs.window import partners
-from rstrack.calibration.parameters import COUNT, NAMES
+from rstrack.calibration.pairs.terms import PairSums, PairTerms
+from rstrack.calibration.pairs.window import add_system, partners, without_brightness
+from rstrack.calibration.parameters import COUNT, NAMES, free_of
 from rstrack.calibration.run import parameters_of
 from rstrack.calibration.start import load_window
 from rstrack.data.dataset import Dataset
@@ -37,7 +36,7 @@ def test_pairs_at_once_sum_to_the_same_as_one_by_one(
     rig = shaken.rig
     shutters = {name: replace(getattr(rig, name), scan=scan) for name in ("depth_shutter", "color_shutter")}
     dataset = bent(replace(shaken, rig=replace(rig, **shutters)))
-    terms, p = pair_terms(engine("llvm"), dataset, FREE), parameters_of(dataset)
+    terms, p = PairTerms(engine("llvm"), dataset, FREE), parameters_of(dataset)
     assert shaken.truth is not None
     window = load_window(terms, dataset, range(4, 12), shaken.truth, p, OPTIONS)
     base, lever = window.base(p)
@@ -73,7 +72,7 @@ def test_pairs_at_once_sum_to_the_same_as_one_by_one(
 def test_views_without_colour_are_compared_by_depth_alone(shaken: Dataset) -> None:
     """Where colour has half of depth's rate, no two images are an odd number of frames apart."""
     halved = replace(shaken, groups=tuple(() if k % 2 else group for k, group in enumerate(shaken.groups)))
-    terms, p = pair_terms(engine("llvm"), halved), parameters_of(halved)
+    terms, p = PairTerms(engine("llvm"), halved, free_of(())), parameters_of(halved)
     assert shaken.truth is not None
     window = load_window(terms, halved, range(4, 18), shaken.truth, p, OPTIONS)
     rough = replace(window, brightness=window.brightness.copy(), is_rough=True)

@@ -11,9 +11,9 @@ import yaml
 from shaken_recording import OPTIONS, READOUT_S, SHORT
 
 from rsgen.array_types import ByteArray, Float32Array
-from rstrack.calibration.camera_file import camera_file_of
 from rstrack.calibration.pairs.window import overcounted
 from rstrack.calibration.parameters import BY_COLOR, COUNT, NAMES, Parameters
+from rstrack.calibration.record import camera_file_of
 from rstrack.calibration.run import calibrate
 from rstrack.calibration.solve import Solution, joined
 from rstrack.data.dataset import Dataset

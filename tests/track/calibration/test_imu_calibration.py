@@ -11,12 +11,13 @@ from tum_recording import make_tum
 from util import random_spline, swung
 
 from rsgen.config.faults import ImuFaults
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu, imu_csv, simulate_imu
-from rstrack.calibration.imu.model import (
+from rstrack.calibration.imu import ImuCalibration, begin, calibrate_imu
+from rstrack.calibration.imu_model import (
     DRIFT,
     LEVER,
     OFFSET,
@@ -27,9 +28,7 @@ from rstrack.calibration.imu.model import (
     ImuUnknowns,
     hats,
 )
-from rstrack.calibration.imu.result import ImuCalibration
-from rstrack.calibration.imu.run import begin, calibrate_imu
-from rstrack.calibration.imu.solve import _alike
+from rstrack.calibration.imu_solve import _alike
 from rstrack.calibration.start import TrackedSpline
 from rstrack.cli.main import main
 from rstrack.data.dataset import Dataset, open_dataset

@@ -12,7 +12,7 @@ from synthetic import make_config, make_sequence
 from tum_recording import STAMPS, make_tum
 from util import swung
 
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.sensors.imu import ImuSamples, imu_csv, simulate_imu

@@ -11,7 +11,7 @@ import synthetic
 import yaml
 
 from rsgen.config.faults import FaultsConfig, ImuFaults
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.formats.export.kalibr import export_kalibr
 from rsgen.geometry import se3

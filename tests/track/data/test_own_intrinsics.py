@@ -21,7 +21,7 @@ from rsgen.sequence.format import pose_rows
 from rstrack.data.dataset import open_dataset
 from rstrack.data.estimate import Estimate
 from rstrack.data.image_files import ImageFiles
-from rstrack.data.own_intrinsics import OwnIntrinsics, SharedImages
+from rstrack.data.registration import OwnIntrinsics, SharedImages
 from rstrack.data.rig import Rig
 from rstrack.metrics.association import truth_of
 from rstrack.metrics.evaluate import evaluate

@@ -15,13 +15,13 @@ from import_command import CONTENT, check_cameras, check_frames, fake_lzfse, imp
 from recordings import COLOR_K, COLOR_SIZE, COUNT
 
 from rsgen.cli.main import main as rsgen
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.geometry import se3
 from rsgen.image_codecs import encode_png
 from rstrack import formats
 from rstrack.cli.info import describe
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.own_intrinsics import SharedImages
+from rstrack.data.registration import SharedImages
 
 # --- others ----------------------------------------------------------------------------------------------------------
 

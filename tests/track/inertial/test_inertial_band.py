@@ -8,7 +8,7 @@ from scipy.interpolate import make_lsq_spline
 
 from rsgen.array_types import FloatArray
 from rsgen.config.faults import ImuFaults
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -17,9 +17,8 @@ from rsgen.sensors.imu import simulate_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
 from rstrack.data.rig import Rig
-from rstrack.inertial.band import MotionBand, missed, with_knots
+from rstrack.inertial.band import ImuReadings, MotionBand, missed, with_knots
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.residuals import ImuReadings
 from rstrack.options import Options
 from rstrack.tracking.spline_tracker import Tracker
 

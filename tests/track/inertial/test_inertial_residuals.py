@@ -13,9 +13,9 @@ from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.band import ImuReadings
 from rstrack.inertial.estimate import SIZE, ImuEstimate
-from rstrack.inertial.factor import ImuFactor, motion
-from rstrack.inertial.residuals import ImuReadings, ImuResiduals
+from rstrack.inertial.factor import ImuFactor, ImuResiduals, motion
 
 T_IMU_DEPTH = se3.exp([0.03, -0.02, 0.05, 0.3, -1.2, 0.7])
 GRAVITY = np.array([1.0, -9.0, 3.5])
@@ -89,12 +89,12 @@ def test_sums_are_the_dense_least_squares() -> None:
     samples = ImuReadings.of(recording(random_motion(4), np.linspace(spline.t_begin + 0.06, spline.t_end, 50)))
     estimate, sigma = ImuEstimate.initial(GRAVITY), np.array([0.01, 0.2])
     rows = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate.mean)
-    joint, scatter = rows.summed(sigma)
+    joint = rows.summed(sigma)
     assert joint is not None and joint.first == 1 and joint.count == len(spline.control_points) - 1
     r, J, first = rows.r, rows.J, rows.first
     change = np.random.default_rng(5).normal(0.0, 0.1, SIZE) * (np.arange(SIZE) < 9)
     expected = ImuResiduals.of(spline, samples, T_IMU_DEPTH, estimate.mean + change).r
-    np.testing.assert_allclose(scatter.after(change), expected, atol=1e-9)
+    np.testing.assert_allclose(rows.after(change), expected, atol=1e-9)
     dense = np.zeros((len(r), 6, 6 * joint.count + SIZE))
     for k, at in enumerate(first - 1):
         dense[k, :, 6 * at : 6 * at + 24], dense[k, :, -SIZE:] = J[k, :, :24], J[k, :, 24:]
@@ -110,7 +110,7 @@ def test_belief_is_eliminated_as_if_it_were_solved_for() -> None:
     samples = ImuReadings.of(recording(random_motion(4), np.linspace(spline.t_begin, spline.t_end, 50)))
     rng, estimate = np.random.default_rng(0), ImuEstimate.initial(GRAVITY)
     at = estimate.mean + rng.normal(0.0, 0.1, SIZE)
-    joint, _ = ImuResiduals.of(spline, samples, T_IMU_DEPTH, at).summed(np.array([0.01, 0.2]))
+    joint = ImuResiduals.of(spline, samples, T_IMU_DEPTH, at).summed(np.array([0.01, 0.2]))
     assert joint is not None
     model, cost, nine = joint.without_imu(estimate, at)
     H, g, known = joint.H, joint.g, estimate.information

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
 from rsgen.array_types import FloatArray
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rsgen.sensors.imu import exact_imu, simulate_imu
@@ -17,10 +17,11 @@ from rstrack.alignment.priors import pose_constraint
 from rstrack.alignment.spline_state import SplineState
 from rstrack.data.imu.description import ImuNoise
 from rstrack.data.imu.recording import ImuRecording
+from rstrack.inertial.band import ImuReadings
 from rstrack.inertial.estimate import SIZE, TURN, TURNED, ImuEstimate, is_contradicted, text
 from rstrack.inertial.estimate import STRENGTH as STRENGTH_SIGMA
+from rstrack.inertial.factor import ImuResiduals
 from rstrack.inertial.inertia import Inertia
-from rstrack.inertial.residuals import ImuReadings, ImuResiduals
 from rstrack.inertial.smoother import ReusedPrior, Smoother
 
 GRAVITY = np.array([2.0, -8.6, 4.262])
@@ -92,7 +93,7 @@ def test_a_small_problem_is_solved_as_by_scipy() -> None:
         smoother.reach(state, 0, count)
         for t, T in poses:
             smoother.add(pose_constraint(state.spline, t, T, POSE_SIGMA)[0])
-        joint, _ = ImuResiduals.of(state.spline, samples, imu.T_imu_depth, estimate).summed(sigma)
+        joint = ImuResiduals.of(state.spline, samples, imu.T_imu_depth, estimate).summed(sigma)
         assert joint is not None
         smoother.add(joint)
         step = -np.linalg.solve(smoother.H, smoother.g)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import synthetic
 
-from rsgen.config.imu import ImuConfig
+from rsgen.config.sections import ImuConfig
 from rsgen.errors import UserError
 from rsgen.geometry import se3, so3
 from rsgen.geometry.camera import Camera

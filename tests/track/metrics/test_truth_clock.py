@@ -21,9 +21,9 @@ from rsgen.sequence.trajectory import Trajectory
 from rstrack.cli.main import main
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.association import Truth
-from rstrack.metrics.clock import fit_clock, shifted
 from rstrack.metrics.evaluate import evaluate
 from rstrack.metrics.run_evaluate import aligned_clock, evaluate_clocks, run_evaluate
+from rstrack.metrics.truth_fit import fit_clock, shifted
 
 KNOT_S = 0.1
 WIGGLE = np.random.default_rng(1).normal(size=(95, 6)) * [0.05, 0.05, 0.05, 0.06, 0.06, 0.06]

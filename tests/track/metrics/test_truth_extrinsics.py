@@ -18,8 +18,8 @@ from rstrack.cli.main import main
 from rstrack.data.estimate import Estimate
 from rstrack.metrics.association import Truth
 from rstrack.metrics.evaluate import evaluate
-from rstrack.metrics.extrinsics import fit_extrinsics, mounted
 from rstrack.metrics.run_evaluate import evaluate_clocks, evaluate_extrinsics, run_evaluate
+from rstrack.metrics.truth_fit import fit_extrinsics, mounted
 
 # Camera in the body's frame: a few centimetres and degrees, and a body with axes of its own.
 SMALL = se3.exp([0.035, -0.031, 0.009, 0.01, 0.02, -0.005])

@@ -164,6 +164,6 @@ def test_a_process_that_dies_is_told_in_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(find_spec("pyorbslam3") is not None, reason="pyorbslam3 is installed")
 def test_without_the_package_it_says_what_to_install() -> None:
-    dataset = type("Dataset", (), {"root": Path("seq"), "__len__": lambda self: 3})()
+    dataset = type("Dataset", (), {"root": Path("seq"), "chosen": lambda self, frames: range(3)})()
     with pytest.raises(UserError, match="pip install 'pyorbslam3"):
         orb_slam3.run_orb_slam3(dataset)  # type: ignore[arg-type]

@@ -26,7 +26,7 @@ from rstrack.charts.to_page import figure_of
 from rstrack.data.estimate import Estimate, write_estimate
 from rstrack.metrics.association import Truth, compare
 from rstrack.metrics.evaluate import evaluate
-from rstrack.metrics.tracked import Tracked
+from rstrack.metrics.run_evaluate import Tracked
 
 SPLINE = synthetic.make_spline()
 STAMPS = np.arange(39) / 30.0

@@ -34,8 +34,8 @@ from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rstrack.bench import paper
-from rstrack.bench.experiments.method_results import read_results
+from rstrack.bench.experiments.methods import read_results
+from rstrack.bench.figures import PAPER_FIGURES
 from rstrack.charts.chart import CameraPath, PathChart, upright_axes
 from rstrack.cli.results import report as report_command
 from rstrack.data.dataset import open_dataset
@@ -358,7 +358,7 @@ def test_the_benchmarks_tables(bench: Path, bench_report: Path) -> None:
     for name in ("robot_t1", "lr_kt2"):
         paired = zip(results.methods, page.row(name)[1:], strict=True)
         for method, text in paired:
-            ate, theirs = results.figure(name, method, "ate_mm"), paper.FIGURES.get((name, method), {}).get("ate_mm")
+            ate, theirs = results.figure(name, method, "ate_mm"), PAPER_FIGURES.get((name, method), {}).get("ate_mm")
             note = "" if theirs is None else f" {significant(theirs)}"
             mark = "" if ate is None or theirs is None or ate < theirs else " ▲"
             assert text == ("failed" if ate is None else f"{significant(ate, 3)}†{mark}{note}")

@@ -22,8 +22,8 @@ from report_util import (
 )
 
 from rsgen.console.tables import Table
-from rstrack.report.build import write_page, write_report
-from rstrack.report.page import Page, PageSection, Sortable
+from rstrack.report.build import write_report
+from rstrack.report.page import Page, PageSection, Sortable, write_page
 
 FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",

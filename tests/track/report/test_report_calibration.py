@@ -59,8 +59,8 @@ def test_a_lens_is_drawn_by_where_it_puts_points(tmp_path: Path) -> None:
 def test_curves_are_broken_where_the_track_was_lost(tmp_path: Path) -> None:
     data = calibration()
     data["pace"] = {"time_s": [0, 0.1, 0.2, 3.0, 3.1], "m_s": [1] * 5, "rad_s": [0] * 5}
-    line = strip_chart(read_record(write_calibration(tmp_path, data))).curves[0][1]
-    assert np.isnan(line.y).tolist() == [False, False, False, True, False, False]
+    speed = strip_chart(read_record(write_calibration(tmp_path, data))).figure["data"][-2]
+    assert [v is None for v in speed["y"]] == [False, False, False, True, False, False]
 
 
 def test_the_camera_file_is_there_to_copy_and_to_save(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from rstrack.data.rig import Image
 from rstrack.options import Options
 from rstrack.tracking.runs import run
 from rstrack.tracking.runs.record import Result
-from rstrack.view.viewer import Viewer, depth_residuals, open_view, world_points
+from rstrack.view import Viewer, depth_residuals, open_view, world_points
 
 
 @pytest.mark.parametrize("scan", ["top-bottom", "bottom-top", "right-left"])

@@ -22,9 +22,8 @@ from rstrack.data.estimate import write_estimate, write_poses
 from rstrack.metrics.association import Truth, truth_of
 from rstrack.report.leaderboard import leaderboard
 from rstrack.report.page import render
-from rstrack.score.results import About, MethodResults, Result, find_methods, read_times
 from rstrack.score.scores import Score, Scores, SequenceScored, score_result
-from rstrack.score.suite import Suite, SuiteEntry, read_suite
+from rstrack.score.suite import About, MethodResults, Result, Suite, SuiteEntry, find_methods, read_suite, read_times
 
 TRUTH = synthetic.make_spline()
 

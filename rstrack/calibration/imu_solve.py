@@ -1,6 +1,6 @@
-"""The joint solution: the IMU, and the track's own errors, which would otherwise pass for accelerations.
+"""The joint solution: an IMU, and the track's own errors, which would otherwise pass for accelerations.
 
-Unknown beside the IMU are the track's corrections x (see `model`), and its drift: world rotation and shift, a line
+Unknown beside the IMU are the track's corrections x (see `imu_model`), and its drift: world rotation and shift, a line
 between values a second apart, which walk. Of the track its poses at the frames are taken for measured, with white
 errors about that drift. How large errors are is found on the way: of poses and of the drift's steps by their residuals,
 of both sensors likewise, but never below what is stated. ImuReadings count robustly (Huber).
@@ -17,7 +17,7 @@ from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded
 
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.errors import UserError
-from rstrack.calibration.imu.model import COUNT, CorrectedTrack, Corrections, ImuPrediction, ImuUnknowns, hats
+from rstrack.calibration.imu_model import COUNT, CorrectedTrack, Corrections, ImuPrediction, ImuUnknowns, hats
 from rstrack.data.imu.description import ImuNoise
 from rstrack.inertial.estimate import bias_walk
 
@@ -43,7 +43,7 @@ _TOO_LITTLE = "IMU: the recording is too poor for it: record 20 s with turns abo
 @dataclass(frozen=True)
 class ImuData:
     """What is given. stamps (n,), readings (n, 6) = [gyro; accel] and which of them count (n, 6); frame_times (k,):
-    when the track's poses hold, s; noise and rate_hz as stated."""
+    when the track's poses hold, s; noise as stated, and sigmas (2,) of a sample by it, rad/s and m/s²."""
 
     track: CorrectedTrack
     stamps: FloatArray
@@ -51,13 +51,7 @@ class ImuData:
     counts: BoolArray
     frame_times: FloatArray
     noise: ImuNoise
-    rate_hz: float
-
-    @property
-    def stated_sigmas(self) -> tuple[float, float]:
-        """Of a sample of either sensor, rad/s and m/s²."""
-        root = float(np.sqrt(self.rate_hz))
-        return self.noise.gyro_density * root, self.noise.accel_density * root
+    sigmas: FloatArray
 
 
 @dataclass(frozen=True)
@@ -103,7 +97,6 @@ class ImuSolution:
     covariance: FloatArray
     x: FloatArray
     sizes: ErrorSizes
-    iterations: int
 
 
 def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda _: None) -> ImuSolution:
@@ -113,7 +106,7 @@ def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda 
     at_frames = data.track.corrections(data.frame_times)
     slow_times = np.arange(data.frame_times[0], data.frame_times[-1] + _SLOW_S, _SLOW_S)
     slow, weights = np.zeros((len(slow_times), 6)), hats(slow_times, data.frame_times)
-    sizes, size = ErrorSizes(*data.stated_sigmas, _POSES, _STEPS), imu.size
+    sizes, size = ErrorSizes(data.sigmas[0], data.sigmas[1], _POSES, _STEPS), imu.size
     for iteration in range(1, _MOST + 1):
         done(iteration)
         normal = _samples(data, imu, x, sizes)
@@ -139,7 +132,7 @@ def solve(data: ImuData, imu: ImuUnknowns, done: Callable[[int], None] = lambda 
         if not np.isfinite(moved).all():
             break
         if iteration > 3 and moved.max() < _SETTLED and sizes.like(before, _SAME):
-            return ImuSolution(imu, covariance, x, sizes, iteration)
+            return ImuSolution(imu, covariance, x, sizes)
     raise UserError(f"{_TOO_LITTLE} (no solution after {_MOST} steps)")
 
 
@@ -230,7 +223,7 @@ def _measured(
     left = np.abs(data.readings - ImuPrediction(data.track, imu, x, data.stamps).readings)
     gyro, accel = (
         max(stated, 1.4826 * float(np.median(left[:, part][data.counts[:, part]])))
-        for stated, part in zip(data.stated_sigmas, (slice(3), slice(3, 6)), strict=True)
+        for stated, part in zip(data.sigmas, (slice(3), slice(3, 6)), strict=True)
     )
     return ErrorSizes(gyro, accel, _rms(about * _alike(about), before.poses), _rms(steps, before.steps))
 

@@ -21,7 +21,7 @@ import numpy as np
 from rsgen.array_types import ByteArray, Float32Array, FloatArray
 from rsgen.console.rerun import recording_file, rerun
 from rsgen.errors import UserError
-from rsgen.files import write_error
+from rsgen.files import make_folder
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
@@ -65,10 +65,7 @@ def open_view(file: Path | None, rig: Rig, name: str) -> Iterator[Viewer]:
         yield Viewer(rr, recording, rig)
         recording.flush()
         return
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(file, error) from None
+    make_folder(file.parent, file)
     with recording_file(file, "rstrack", name, "--view") as (rr, recording):
         yield Viewer(rr, recording, rig)
 
@@ -138,8 +135,8 @@ class Viewer:
             picture = rr.EncodedImage(contents=jpeg(frame.colors[0].pixels, _WIDTH), media_type="image/jpeg")
             log("world/camera/color/image", picture)
         stride = -(-frame.depth.pixels.shape[1] // _WIDTH)
-        z = _millimetres(frame.depth.pixels[::stride, ::stride])
-        log("world/camera/depth/image", rr.DepthImage(z, meter=1000.0))
+        z_mm = np.clip(np.rint(1e3 * frame.depth.pixels[::stride, ::stride]), 0, 65535).astype(np.uint16)
+        log("world/camera/depth/image", rr.DepthImage(z_mm, meter=1000.0))
 
     def _pose(self, spline: Spline, frame: Frame) -> None:
         shutter, camera = self.rig.depth_shutter, self.rig.depth_camera
@@ -193,10 +190,6 @@ def jpeg(rgb: ByteArray, width: int) -> bytes:
         height = round(rgb.shape[0] * width / rgb.shape[1])
         rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
     return bytes(cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
-
-
-def _millimetres(z: FloatArray) -> Any:
-    return np.clip(np.rint(1e3 * z), 0, 65535).astype(np.uint16)
 
 
 def _diverging(x: FloatArray) -> ByteArray:

@@ -135,9 +135,7 @@ class CorrectedTrack:
         by_rate[:, :3, 6:9], by_rate[:, 3:, 6:9] = hat(v_new), hat(omega_new)
         by_rate[:, :3, 9:12], by_rate[:, 3:, 12:15], by_rate[:, :3, 15:] = -hat(omega_new) @ to_body, np.eye(3), to_body
         by_turn[:, :, :3] = R_new
-        return BodyMotion(
-            at.first, R_new, np.concatenate([v_new, omega_new], axis=1), rate, by_twist, by_rate, by_turn
-        )  # fmt: skip
+        return BodyMotion(at.first, R_new, np.concatenate([v_new, omega_new], axis=1), rate, by_twist, by_rate, by_turn)
 
 
 @dataclass(frozen=True)
