@@ -74,10 +74,10 @@ def whole_folder(path: Path) -> Iterator[Path]:
             path.rename(old)
         os.replace(temporary, path)  # noqa: PTH105 - one name for tests to break
     except OSError as error:
-        if old.exists() and not path.exists():
-            old.rename(path)
         raise write_error(path, error) from None
     finally:
+        if old.exists() and not path.exists():
+            old.rename(path)
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
 

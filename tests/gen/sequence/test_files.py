@@ -204,6 +204,27 @@ def test_an_interrupt_leaves_no_temporary_file(tmp_path: Path, monkeypatch: pyte
     assert names(tmp_path) == []
 
 
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "full"), KeyboardInterrupt()])
+def test_a_folder_that_cannot_be_replaced_stays_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def write(content: str) -> None:
+        with files.whole_folder(tmp_path / "room") as folder:
+            (folder / "a.txt").write_text(content)
+
+    def fail(*_: Any) -> None:
+        raise error
+
+    write("old")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        with pytest.raises((UserError, KeyboardInterrupt)):
+            write("new")
+    assert names(tmp_path) == ["room"] and (tmp_path / "room/a.txt").read_text() == "old"
+    write("new")
+    assert names(tmp_path) == ["room"] and (tmp_path / "room/a.txt").read_text() == "new"
+
+
 def test_temporaries_of_dead_writers_are_removed_and_others_kept(tmp_path: Path) -> None:
     dead = 2**22 + 5  # above the largest process number of Linux
     for name in (f".a.png.{dead}.tmp", f".b.png.{os.getpid()}.tmp", ".notes.tmp", "c.png"):
