@@ -25,7 +25,7 @@ from rstrack.data.dataset import Dataset
 from rstrack.data.estimate import INFO
 from rstrack.keyframes.archive import Archive
 from rstrack.tracking.loop_tracker import LoopTracker
-from rstrack.tracking.runs.record import Done
+from rstrack.tracking.runs.done import Done
 from rstrack.tracking.spline_tracker import Tracker
 
 FOLDER = "checkpoint"

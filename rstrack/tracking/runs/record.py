@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,6 +20,7 @@ from rstrack.data.timing import Timing
 from rstrack.options import Options
 from rstrack.tracking.any_tracker import AnyTracker
 from rstrack.tracking.frame_report import FrameReport
+from rstrack.tracking.runs.done import Done
 from rstrack.tracking.runs.segments import Segments
 
 if TYPE_CHECKING:
@@ -41,21 +42,6 @@ class Noise:
     sigma_depth: float = 0.0
     sigma_intensity: float = 0.0
     seed: int = 0
-
-
-@dataclass
-class Done:
-    """How far a run is: frames that have been looked at, seconds that it took, and what became of the frames.
-
-    waited: seconds that the tracker waited for each frame's images. seconds: that it took for each that it was fed.
-    """
-
-    count: int = 0
-    total_s: float = 0.0
-    waited: list[float] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-    fed: list[int] = field(default_factory=list)
-    unreadable: list[tuple[int, str]] = field(default_factory=list)
 
 
 @dataclass

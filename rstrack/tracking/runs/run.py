@@ -34,7 +34,8 @@ from rstrack.tracking.frame_report import FrameReport
 from rstrack.tracking.loop_closing import Closing, close_loops
 from rstrack.tracking.loop_tracker import LoopTracker
 from rstrack.tracking.runs.checkpoint import checkpoint_of
-from rstrack.tracking.runs.record import Done, End, Noise, Result, Run, keyframes_text, run_info
+from rstrack.tracking.runs.done import Done
+from rstrack.tracking.runs.record import End, Noise, Result, Run, keyframes_text, run_info
 from rstrack.tracking.runs.segments import segments_beside
 from rstrack.tracking.spline_tracker import Tracker
 

@@ -20,7 +20,7 @@ from rstrack.cli.main import main
 from rstrack.data.estimate import read_estimate
 from rstrack.options import METHODS, Options
 from rstrack.tracking.runs import run as run_module
-from rstrack.tracking.runs.record import Done
+from rstrack.tracking.runs.done import Done
 
 COMMANDS = ("import", "info", "calibrate", "track", "refine", "evaluate", "report", "map", "export", "bench")
 

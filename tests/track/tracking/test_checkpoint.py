@@ -25,7 +25,8 @@ from rstrack.data.dataset import Dataset, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.options import Options
 from rstrack.tracking.runs import checkpoint
-from rstrack.tracking.runs.record import Done, Noise
+from rstrack.tracking.runs.done import Done
+from rstrack.tracking.runs.record import Noise
 from rstrack.tracking.runs.run import track
 from rstrack.tracking.spline_tracker import Tracker
 
