@@ -279,8 +279,10 @@ def test_memory_stays_flat(config: Path, tmp_path: Path) -> None:
         lambda stage, *_: pages.append(resident_pages()) if stage == "frames" else None,
     )  # fmt: skip
     assert len(pages) == 360
-    growth = (max(pages[-20:]) - max(pages[40:60])) * os.sysconf("SC_PAGESIZE")
-    assert growth < 1.5e6, f"{growth / 1e6:.1f} MB in 150 frames"
+    begin, middle, end = (max(pages[at : at + 20]) for at in (40, 190, 340))
+    # What is kept of each frame grows in both halves; what other tests of the process left behind grows once.
+    growth = min(middle - begin, end - middle) * os.sysconf("SC_PAGESIZE")
+    assert growth < 0.75e6, f"{growth / 1e6:.1f} MB in 75 frames"
 
 
 T_COLOR_DEPTH = [[0.9998, 0.0, -0.02, -0.05], [0.0, 1.0, 0.0, 0.01], [0.02, 0.0, 0.9998, 0.002], [0.0, 0.0, 0.0, 1.0]]
