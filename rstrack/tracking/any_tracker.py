@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Protocol
 
 from rsgen.array_types import FloatArray
@@ -107,4 +108,5 @@ def make_tracker(
     if isinstance(first, Tracker):
         # Before the first frame: what is known of the cameras.
         made.track.covariances.uncertainty = first.track.covariances.uncertainty.begun_anew()
+        made.track.scales, made.track.independence = deepcopy((first.track.scales, first.track.independence))
     return made

@@ -94,13 +94,14 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
-        # Images that fit far worse than the last ones may show another place: that of the prediction is not known then.
-        is_odd = track.scales.exceeded(on_reference)
-        if young and not fault and (is_odd or not found.whole):
+        # An image that fits far worse than the last ones may show another place: the prediction does not hold then. Of
+        # one sensor its noise may be the cause, as on what is far away; where both are odd nothing is known.
+        odd = track.scales.exceeded(on_reference)
+        if not fault and (1 < len(odd) == len(on_reference) or (young and (odd or not found.whole))):
             fault = Fault.MISFIT
         if not rolls:
             seen = score.information
-            if weighs and is_odd:
+            if weighs and odd:
                 uncertainty = uncertainty.found_anew(seen)
             else:
                 uncertainty = uncertainty.after(seconds, seen, *accelerations)

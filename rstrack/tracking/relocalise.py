@@ -10,10 +10,13 @@ import numpy as np
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment import brightness
+from rstrack.alignment.priors import ACCELERATION
 from rstrack.images.device_frame import DeviceFrame
+from rstrack.images.fast_spline import motion
 from rstrack.keyframes import coarse_search
 from rstrack.keyframes.keyframe import Reference
 from rstrack.tracking.frame_report import Fault
+from rstrack.tracking.judgement.innovation import Prediction, by_images, contradicts
 from rstrack.tracking.judgement.lost_track import implausible
 from rstrack.tracking.matching import Match, Verdict, judge_unpredicted, match
 from rstrack.tracking.track import TrackState
@@ -66,11 +69,14 @@ class Bridge:
 
 @dataclass(frozen=True)
 class _Jump:
-    """A pose further from the last than a hand moves a camera: at a keyframe, at a time (s). To be confirmed."""
+    """A pose at a keyframe that the motion before does not lead to. To be confirmed.
+
+    state: of a camera there; of covariance 0 where that is not known.
+    """
 
     ref: Reference
     T_ref_cam: FloatArray
-    time: float
+    state: Prediction
 
 
 class Relocaliser:
@@ -104,15 +110,37 @@ class Relocaliser:
                 break
         if fault:
             return fault
-        window, end, mid = track.known()[0], track.found.end, new.depth.exposure.mid_time
-        T_found = found.window.spline.pose(mid)
-        near = [(window.spline.pose(end), end)]
-        if jump:
-            near.append((jump.ref.T_world_base @ jump.T_ref_cam, jump.time))
-        if all(implausible(T, T_found, mid - time) for T, time in near):
-            self._jump = _Jump(found.ref, se3.inverse(found.ref.T_world_base) @ T_found, mid)
+        (window, ref), now = track.known(), self._state(track, found)
+        recent, uncertainty = track.succession.recent, track.covariances.uncertainty
+        end = recent[-1].depth.exposure.mid_time if recent else track.found.end
+        last = Prediction(end, *motion(window.spline, end), uncertainty.state + uncertainty.mixture)
+        before = [(ref, last), *([(jump.ref, jump.state)] if jump else [])]
+        if not any(self._leads_to(track, there, state, found.ref, now) for there, state in before):
+            T_found = found.window.spline.pose(new.depth.exposure.mid_time)
+            self._jump = _Jump(found.ref, se3.inverse(found.ref.T_world_base) @ T_found, now)
             return Fault.UNCONFIRMED
         return found, verdict
+
+    def _state(self, track: TrackState, found: Match) -> Prediction:
+        """What a frame's images say of its state."""
+        state, mid = found.window.state, found.frame.depth.exposure.mid_time
+        median = track.covariances.uncertainty.systematic.median_inflation
+        said = by_images(found.fresh, state, track.covariances.considered(0.0), median) if track.is_modelled else None
+        return said or Prediction(mid, *motion(state.spline, mid), np.zeros((12, 12)))
+
+    def _leads_to(
+        self, track: TrackState, there: Reference, before: Prediction, ref: Reference, now: Prediction
+    ) -> bool:  # fmt: skip
+        """Whether a camera in one state at a keyframe may be in another one at `ref` later on."""
+        if implausible(before.T_world_depth, now.T_world_depth, now.t - before.t):
+            return False
+        if not now.covariance.any() or not before.covariance.any() or track.has_gyro:
+            return True
+        to_camera = se3.adjoint(se3.inverse(now.T_world_depth))
+        drift_of = track.covariances.uncertainty.drift_of
+        older, newer = sorted((there.index, ref.index))
+        drift = to_camera @ (drift_of(newer) - drift_of(older)) @ to_camera.T
+        return not contradicts(before, now, ACCELERATION, drift)
 
     def _searched(
         self, track: TrackState, new: DeviceFrame, T_led: FloatArray | None

@@ -162,14 +162,12 @@ def disagreement(
     than they, the calibration and the median inflation explain, either of them may be right: each counts as if it were.
     median: see `Systematic.median_inflation`; a wrong camera file makes all frames' images disagree.
     """
-    aligned = [o for o in fresh if o.is_linearised]
-    if not aligned:
+    here, seen = _unpredicted(fresh, state, considered)
+    if not seen:
         return np.zeros((12, 12))
-    first = max(aligned, key=lambda o: o.is_depth)
+    first = max((one.observation for one in seen), key=lambda o: o.is_depth)
     exposure, distance = first.image.exposure, first.ref.median_depth
-    mid, half = exposure.mid_time, 0.5 * (exposure.last_time - exposure.first_time)
-    here = Prediction(mid, *motion(state.spline, mid), Uncertainty().state)
-    seen = [_measured(o, state, here, considered) for o in aligned]
+    half = 0.5 * (exposure.last_time - exposure.first_time)
 
     def squared(z: FloatArray) -> FloatArray:
         ends = z[:6] - half * z[6:], z[:6] + half * z[6:]
@@ -182,6 +180,33 @@ def disagreement(
     z, R, _ = _combined(seen)
     beyond = max(0.0, 1.0 - len(z) / max(float(z @ np.linalg.solve(R, z)), 1e-12))
     return np.asarray(beyond * squared(z) + max(0.0, 1.0 - median / inflation) * apart)
+
+
+def by_images(
+    fresh: Sequence[Observation], state: SplineState, considered: Considered | None = None, median: float = 1.0
+) -> Prediction | None:  # fmt: skip
+    """What a frame's images say of its pose and velocity, with nothing else known; None without images.
+
+    median: as in `disagreement`.
+    """
+    here, seen = _unpredicted(fresh, state, considered)
+    if not seen:
+        return None
+    z, R, D = _combined(seen)
+    T_world_depth = np.asarray(here.T_world_depth @ se3.exp(z[:6]))
+    return Prediction(here.t, T_world_depth, here.velocity + z[6:], median * R + D @ D.T)
+
+
+def contradicts(before: Prediction, now: Prediction, accelerations: FloatArray, drift: FloatArray) -> bool:
+    """Whether no motion leads from one state to another: their innovation is beyond the limit.
+
+    accelerations (6,): σ, m/s² and rad/s². drift (6, 6): covariance of the keyframes' poses against each other, in the
+    camera's axes.
+    """
+    P = Uncertainty(state=before.covariance).predicted(now.t - before.t, accelerations) + now.covariance
+    P[:6, :6] += drift
+    off = np.concatenate([twist_between(before.pose(now.t), now.T_world_depth), now.velocity - before.velocity])
+    return bool(off @ np.linalg.solve(P, off) > _LIMIT)
 
 
 def learnt(
@@ -205,6 +230,16 @@ def learnt(
     focal_px, depth_m = depth.observation.ref.lens.camera.fx, depth.observation.ref.median_depth
     both = (depth.R + color.R)[:6, :6] - 2.0 * of_pixels(SYSTEMATIC_PX, focal_px, depth_m)
     return known.with_frame(apart, excess**2 * both + D @ D.T, focal_px, depth_m), errors
+
+
+def _unpredicted(
+    fresh: Sequence[Observation], state: SplineState, considered: Considered | None
+) -> tuple[Prediction, list[_Measured]]:  # fmt: skip
+    """The state that was found, as if that were the prediction, and what each image says against it."""
+    aligned = [o for o in fresh if o.is_linearised]
+    mid = max(aligned, key=lambda o: o.is_depth).image.exposure.mid_time if aligned else state.spline.t0
+    here = Prediction(mid, *motion(state.spline, mid), Uncertainty().state)
+    return here, [_measured(o, state, here, considered) for o in aligned]
 
 
 def _expected(odd: _Measured, P: FloatArray, rest: Sequence[_Measured]) -> tuple[FloatArray, FloatArray]:

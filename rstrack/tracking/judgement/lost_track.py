@@ -52,9 +52,9 @@ class RunningScales:
             else:
                 self._color.append(o.lin.next_sigma)
 
-    def exceeded(self, fresh: Sequence[Observation]) -> bool:
-        """Whether an image of a frame fits worse than the last ones did; never where no scale is known."""
-        return any(o.lin.next_sigma > self._most(o) for o in fresh)
+    def exceeded(self, fresh: Sequence[Observation]) -> list[Observation]:
+        """Images of a frame that fit worse than the last ones did; none where no scale is known."""
+        return [o for o in fresh if o.lin.next_sigma > self._most(o)]
 
     def _most(self, o: Observation) -> float:
         last, harmless = (self._depth, _HARMLESS_DEPTH) if o.is_depth else (self._color, _HARMLESS_INTENSITY)

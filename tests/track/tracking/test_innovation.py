@@ -13,7 +13,15 @@ from scipy.stats import chi2
 from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
-from rstrack.tracking.judgement.innovation import Prediction, disagreement, learnt, mixture, weighed
+from rstrack.tracking.judgement.innovation import (
+    Prediction,
+    by_images,
+    contradicts,
+    disagreement,
+    learnt,
+    mixture,
+    weighed,
+)
 from rstrack.tracking.judgement.uncertainty import Systematic
 
 HALF = 0.015
@@ -241,3 +249,34 @@ def test_inflations_of_predicted_frames_are_learnt() -> None:
         assert not errors.mean.any(), "of an exact calibration"
         medians.append(known.median_inflation)
     assert medians[:5] == [1.0] * 5 and medians[6] == found.own > 1e3  # a median: two of five frames do not move it
+
+
+def test_what_images_say_by_themselves() -> None:
+    rng = np.random.default_rng(8)
+    R, off = spread(1e-3, 1e-3, rng), 1e-3 * rng.normal(size=12)
+    said = by_images([image(True, R, off)], at_rest()[0], median=4.0)
+    assert said is not None and by_images([], at_rest()[0]) is None and said.t == 0.1
+    np.testing.assert_allclose(se3.log(said.T_world_depth), off[:6], rtol=3e-3, atol=2e-6)
+    np.testing.assert_allclose(said.velocity, off[6:] / HALF, rtol=3e-3, atol=2e-4)
+    np.testing.assert_allclose(said.covariance * np.outer(BY, BY) / R, 4.0, rtol=5e-2)
+
+
+def test_two_states_contradict_each_other_as_seldom_as_the_level_says() -> None:
+    """Against draws of a motion whose acceleration is random, one in 1,000."""
+    rng, dt, trials = np.random.default_rng(4), 0.05, 1000
+    P, R, drift = (spread(4e-3, 5e-3, rng) / np.outer(BY, BY) for _ in range(3))
+    sigma = np.array([5.0, 5.0, 5.0, 10.0, 10.0, 10.0])
+    draw = [np.linalg.cholesky(C) for C in (P, R, drift[:6, :6])]
+    odd = 0
+    for _ in range(trials):
+        a, off = sigma * rng.normal(size=6), draw[0] @ rng.normal(size=12)
+        pose = off[:6] + dt * off[6:] + 0.5 * dt**2 * a + draw[2] @ rng.normal(size=6)
+        seen = np.concatenate([pose, off[6:] + dt * a]) + draw[1] @ rng.normal(size=12)
+        now = Prediction(0.1 + dt, se3.exp(seen[:6]), seen[6:], R)
+        odd += contradicts(Prediction(0.1, np.eye(4), np.zeros(6), P), now, sigma, drift[:6, :6])
+    assert odd <= chi2.ppf(0.999, 2 * (1 + 1)) / 2, "one is expected"
+    assert contradicts(Prediction(0.1, np.eye(4), np.zeros(6), P), replace_velocity(now), sigma, drift[:6, :6])
+
+
+def replace_velocity(state: Prediction) -> Prediction:
+    return Prediction(state.t, state.T_world_depth, state.velocity + 50.0, state.covariance)

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from test_spline_tracker import TRUTH, blank, frame_at, tracker_of
+from test_spline_tracker import TRUTH, blank, feed, frame_at, tracker_of
 
 from rsgen.geometry import se3
 from rsgen.sequence.trajectory import read_trajectory
 from rstrack.data.estimate import SEGMENTS, Estimate
 from rstrack.data.rig import Frame
 from rstrack.tracking.frame_report import Fault, FrameReport, frame_report
-from rstrack.tracking.runs.segments import Segment, Segments
+from rstrack.tracking.runs.segments import Segment, Segments, segments_beside
+from rstrack.tracking.spline_tracker import Tracker
 
 
 def true_poses(stamps: np.ndarray) -> np.ndarray:
@@ -200,3 +201,20 @@ def test_a_real_tracker_goes_on_where_the_first_one_is_lost() -> None:
     assert np.rint(30.0 * joined.stamps).tolist() == [*range(36)]
     error = se3.inverse(TRUTH.pose(joined.stamps)) @ joined.T_world_depth
     assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 3e-3
+
+
+def test_a_segment_begins_with_what_the_first_track_knows_of_the_images() -> None:
+    """Regression: where it did not know how well images fit, a jump to another place passed, 0.3 m off."""
+    first = feed(tracker_of("rs-g"), (frame_at(k) for k in range(12)))
+    made = segments_beside(first, first.rig, first.options, frame_at).make()
+    assert isinstance(made, Tracker)
+
+    def known(tracker: Tracker) -> list[Any]:
+        return [
+            list(seen) for part in (tracker.track.scales, *tracker.track.independence) for seen in vars(part).values()
+        ]
+
+    usual = known(first)
+    assert known(made) == usual and usual[0] and usual[2]
+    feed(made, (frame_at(k) for k in range(6, 14)))
+    assert known(first) == usual != known(made), "each learns for itself"

@@ -230,6 +230,23 @@ def test_where_an_image_fits_far_worse_than_usual_the_motion_before_does_not_mak
         assert report.lost == (k == 11 and is_odd), (k, report.fault)
 
 
+@pytest.mark.parametrize(("depth", "color"), [(True, False), (False, True), (True, True)])
+def test_a_frame_none_of_whose_images_fits_as_usual_is_lost(depth: bool, color: bool) -> None:
+    """Regression: after a jump to another place both fitted four times worse than usual, and it was 0.3 m off."""
+    tracker, rng = (
+        Tracker(Rig(CAMERA, GLOBAL, CAMERA, GLOBAL, np.eye(4)), Options(method="gs-pg")),
+        np.random.default_rng(1),
+    )
+    for k in range(14):
+        z, pixels = at_a_wall(k)
+        if k == 11 and depth:
+            z = (z + 0.03 * rng.normal(size=z.shape)).astype(np.float32)
+        if k == 11 and color:
+            pixels = np.clip(pixels + 45.0 * rng.normal(size=z.shape)[..., None], 0, 255).astype(np.uint8)
+        report = tracker.feed(Frame(Image(k / 30, z), (Image(k / 30, pixels),)))
+        assert report.lost == (k == 11 and depth and color), (k, report.fault)
+
+
 def test_nothing_but_blank_frames() -> None:
     tracker = feed(tracker_of("rs-pg"), (blank(frame_at(k)) for k in range(3)))
     assert lost(tracker) == [0, 1, 2] and tracker.spline is None and len(tracker.trajectory[0]) == 0
