@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
-from rstrack.alignment import brightness
+from rstrack.alignment.observation import matched_brightness
 from rstrack.alignment.priors import ACCELERATION
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.fast_spline import motion
@@ -69,14 +67,11 @@ class Bridge:
 
 @dataclass(frozen=True)
 class _Jump:
-    """A pose at a keyframe that the motion before does not lead to. To be confirmed.
-
-    state: of a camera there; of covariance 0 where that is not known.
-    """
+    """A pose that does not follow from the motion before: at a keyframe, at a time (s). To be confirmed."""
 
     ref: Reference
     T_ref_cam: FloatArray
-    state: Prediction
+    time: float
 
 
 class Relocaliser:
@@ -110,37 +105,14 @@ class Relocaliser:
                 break
         if fault:
             return fault
-        (window, ref), now = track.known(), self._state(track, found)
-        recent, uncertainty = track.succession.recent, track.covariances.uncertainty
-        end = recent[-1].depth.exposure.mid_time if recent else track.found.end
-        last = Prediction(end, *motion(window.spline, end), uncertainty.state + uncertainty.mixture)
-        before = [(ref, last), *([(jump.ref, jump.state)] if jump else [])]
-        if not any(self._leads_to(track, there, state, found.ref, now) for there, state in before):
-            T_found = found.window.spline.pose(new.depth.exposure.mid_time)
-            self._jump = _Jump(found.ref, se3.inverse(found.ref.T_world_base) @ T_found, now)
+        mid = new.depth.exposure.mid_time
+        T_found = found.window.spline.pose(mid)
+        if jump and not implausible(jump.ref.T_world_base @ jump.T_ref_cam, T_found, mid - jump.time):
+            return found, verdict
+        if not _follows(track, found):
+            self._jump = _Jump(found.ref, se3.inverse(found.ref.T_world_base) @ T_found, mid)
             return Fault.UNCONFIRMED
         return found, verdict
-
-    def _state(self, track: TrackState, found: Match) -> Prediction:
-        """What a frame's images say of its state."""
-        state, mid = found.window.state, found.frame.depth.exposure.mid_time
-        median = track.covariances.uncertainty.systematic.median_inflation
-        said = by_images(found.fresh, state, track.covariances.considered(0.0), median) if track.is_modelled else None
-        return said or Prediction(mid, *motion(state.spline, mid), np.zeros((12, 12)))
-
-    def _leads_to(
-        self, track: TrackState, there: Reference, before: Prediction, ref: Reference, now: Prediction
-    ) -> bool:  # fmt: skip
-        """Whether a camera in one state at a keyframe may be in another one at `ref` later on."""
-        if implausible(before.T_world_depth, now.T_world_depth, now.t - before.t):
-            return False
-        if not now.covariance.any() or not before.covariance.any() or track.has_gyro:
-            return True
-        to_camera = se3.adjoint(se3.inverse(now.T_world_depth))
-        drift_of = track.covariances.uncertainty.drift_of
-        older, newer = sorted((there.index, ref.index))
-        drift = to_camera @ (drift_of(newer) - drift_of(older)) @ to_camera.T
-        return not contradicts(before, now, ACCELERATION, drift)
 
     def _searched(
         self, track: TrackState, new: DeviceFrame, T_led: FloatArray | None
@@ -172,7 +144,7 @@ class Relocaliser:
         self, track: TrackState, new: DeviceFrame, ref: Reference, T_ref_cam: FloatArray
     ) -> tuple[Match, Verdict]:  # fmt: skip
         window = track.known()[0]
-        fresh = track.observe(new, ref, _matched(new, ref))
+        fresh = track.observe(new, ref, matched_brightness(new, ref))
 
         def begin() -> Window:
             return window.restarted(new, track.found.end, ref.T_world_base @ T_ref_cam)
@@ -181,14 +153,28 @@ class Relocaliser:
         return found, judge_unpredicted(track, found)
 
 
+def _follows(track: TrackState, found: Match) -> bool:
+    """Whether a pose follows from the last ones: no further than a hand moves a camera, and as their velocity has it.
+
+    By itself an image may be off in its velocity, and in its pose with it, as where it is blurred otherwise than its
+    keyframe. Under the wrong shutter, or beside a gyroscope, images are not held against a prediction.
+    """
+    (window, ref), state, mid = track.known(), found.window.state, found.frame.depth.exposure.mid_time
+    end, uncertainty = track.found.end, track.covariances.uncertainty
+    if implausible(window.spline.pose(end), state.spline.pose(mid), mid - end):
+        return False
+    if track.has_gyro or not track.is_modelled:
+        return True
+    now = by_images(found.fresh, state, track.covariances.considered(0.0), uncertainty.systematic.median_inflation)
+    last = Prediction(end, *motion(window.spline, end), uncertainty.state + uncertainty.mixture)
+    to_camera = se3.adjoint(se3.inverse(state.spline.pose(mid)))
+    older, newer = sorted((ref.index, found.ref.index))
+    drift = to_camera @ (uncertainty.drift_of(newer) - uncertainty.drift_of(older)) @ to_camera.T
+    return now is None or not contradicts(last, now, ACCELERATION, drift)
+
+
 def where_led(
     T_led: FloatArray, places: Sequence[Reference], ranked: Sequence[tuple[int, FloatArray]]
 ) -> list[tuple[int, FloatArray]]:
     """Those of ranked poses, T_place_cam (4, 4) at a place by its number, where an IMU may have led: T_led (4, 4)."""
     return [(k, T) for k, T in ranked if not implausible(T_led, places[k].T_world_base @ T, _LED_OFF_S)]
-
-
-def _matched(frame: DeviceFrame, ref: Reference) -> FloatArray:
-    if not (frame.colors and ref.points):
-        return np.asarray(brightness.SAME)
-    return np.asarray(brightness.matched(frame.colors[0].moments, ref.moments))
