@@ -141,10 +141,10 @@ def unfinished(solved: Solved, state: SplineState, t: float) -> FloatArray:
 
 
 def judge_unpredicted(track: TrackState, found: Match) -> Verdict:
-    """Whether a frame was found where nothing led."""
+    """Whether a frame was found where nothing led: not where it vibrates, which the spline does not follow."""
     state = found.window.state
     verdict = judge_alone(track.scales, track.covariances, found.fresh, found.solved, state, found.ref.pixels)
-    if not found.whole:
+    if not found.whole or all(track.scatters(o) for o in found.fresh):
         verdict = replace(verdict, fault=Fault.MISFIT)
     if not verdict.fault:
         track.scales.learn(found.fresh)

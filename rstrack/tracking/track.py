@@ -33,7 +33,7 @@ from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.frame_report import Fault, FrameReport, frame_report
 from rstrack.tracking.judgement.consider import Calibration
-from rstrack.tracking.judgement.lost_track import RunningScales
+from rstrack.tracking.judgement.lost_track import GROWTH, RunningScales
 from rstrack.tracking.judgement.uncertainty import PoseCovariances
 from rstrack.tracking.moving.leave_out import LeftOut, leave_out
 from rstrack.tracking.succession import Gains, Succession
@@ -202,6 +202,10 @@ class TrackState:
         """Let the pixels of observations count as far as they are independent by what is known now."""
         for o in observations:
             o.count_as(1.0 / self.independence[not o.is_depth].inflation)
+
+    def scatters(self, o: Observation) -> bool:
+        """Whether an image's rows scatter by as much more than usual as a whole one may not."""
+        return o.inflation > GROWTH**2 * self.independence[not o.is_depth].inflation
 
     def learn(self, found: Match, excess: float, new: DeviceFrame) -> None:
         """What frame `new`, found where the motion led, says of the spline, the IMU and its own pixels.

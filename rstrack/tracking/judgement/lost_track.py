@@ -23,7 +23,7 @@ _LEAST_FIT_DEPTH, _LEAST_FIT_COLOR = 0.65, 0.8
 # frame 24, runs away after a place is found again, and two faults on lr_kt2-320 are silent, 0.1 and 0.5 m off), and
 # scales that are harmless anyway (m at one metre, intensity): a camera at rest repeats its rounding, and a keyframe
 # without contrast shows nothing.
-_GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 3.5, 2e-3, 0.03
+GROWTH, _HARMLESS_DEPTH, _HARMLESS_INTENSITY = 3.5, 2e-3, 0.03
 # Frames of a running median.
 _MEMORY = 30
 # Changes of velocity that no hand makes, m/s² and rad/s² (hand-held cameras reach 35 m/s²), nor over a longer time, m/s
@@ -59,7 +59,7 @@ class RunningScales:
     def _most(self, o: Observation) -> float:
         last, harmless = (self._depth, _HARMLESS_DEPTH) if o.is_depth else (self._color, _HARMLESS_INTENSITY)
         distance = o.ref.median_depth if o.is_depth else 1.0
-        return distance**2 * max(harmless, _GROWTH * median(last)) if last else np.inf
+        return distance**2 * max(harmless, GROWTH * median(last)) if last else np.inf
 
 
 def misfits(fresh: Sequence[Observation], expected: int) -> list[tuple[Observation, Fault]]:

@@ -14,6 +14,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.observation import Scores
 from rstrack.alignment.optimizer import Solved
+from rstrack.alignment.weights import Independence
 from rstrack.images.fast_spline import motion
 from rstrack.images.pyramid import DepthImage
 from rstrack.options import Options
@@ -25,6 +26,7 @@ from rstrack.tracking.judgement.uncertainty import Uncertainty
 from rstrack.tracking.matching import Match, judge_unpredicted, without_misfits
 from rstrack.tracking.relocalise import Relocaliser, where_led
 from rstrack.tracking.succession import Succession
+from rstrack.tracking.track import TrackState
 
 REF: Any = SimpleNamespace(index=0, pixels=5000, T_world_base=np.eye(4), median_depth=1.0)
 
@@ -58,10 +60,12 @@ def test_a_place_is_found_by_all_of_a_frame_s_images_only(monkeypatch: pytest.Mo
         uncertainty=Uncertainty(), common=None, after=lambda *_: None, considered=lambda _: None
     )
     track: Any = SimpleNamespace(covariances=covariances, scales=RunningScales())
-    for whole, says in ((True, Fault.NONE), (False, Fault.MISFIT)):
+    for whole, scatters, says in ((True, False, Fault.NONE), (False, False, Fault.MISFIT), (True, True, Fault.MISFIT)):
+        track.scatters = lambda _, scatters=scatters: scatters
         given: list[Any] = [None, REF, SimpleNamespace(state=None), None, [seen("depth")], Solved(last_shift=0.0), None]
         assert judge_unpredicted(track, Match(*given, whole)).fault is says
     # Where frames have fitted ten times better it is another place.
+    track.scatters = lambda _: False
     track.scales.reset()
     for _ in range(3):
         better = seen("depth")
@@ -208,3 +212,11 @@ def test_who_comes_back_to_a_keyframe_may_see_half_of_it() -> None:
     succession._refer_to(cast(Any, SimpleNamespace(index=3)))
     assert succession.overlap(pixels_of(3, 500)) == 1.0
     assert succession.overlap([SimpleNamespace(is_linearised=False)]) == 0.0  # type: ignore[list-item]
+
+
+@pytest.mark.parametrize(("inflation", "is_more"), [(24.0, False), (25.0, True), (np.nan, False)])
+def test_rows_that_scatter_by_three_and_a_half_times_as_much_as_usual_vibrate(inflation: float, is_more: bool) -> None:
+    independence = Independence(), Independence()
+    independence[0].learn([2.0] * 3)
+    track = cast(Any, SimpleNamespace(independence=independence))
+    assert TrackState.scatters(track, cast(Any, SimpleNamespace(is_depth=True, inflation=inflation))) is is_more
