@@ -166,7 +166,8 @@ def _follows(track: TrackState, found: Match) -> bool:
     if track.has_gyro or not track.is_modelled:
         return True
     now = by_images(found.fresh, state, track.covariances.considered(0.0), uncertainty.systematic.median_inflation)
-    last = Prediction(end, *motion(window.spline, end), uncertainty.state + uncertainty.mixture)
+    begin = mid - (found.frame.stamp - track.found.stamps[-1])
+    last = Prediction(begin, *motion(window.spline, begin), uncertainty.state + uncertainty.mixture)
     to_camera = se3.adjoint(se3.inverse(state.spline.pose(mid)))
     older, newer = sorted((ref.index, found.ref.index))
     drift = to_camera @ (uncertainty.drift_of(newer) - uncertainty.drift_of(older)) @ to_camera.T

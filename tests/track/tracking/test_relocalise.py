@@ -100,14 +100,14 @@ class Sees(Relocaliser):
 
 
 def frame(time: float) -> Any:
-    return SimpleNamespace(depth=SimpleNamespace(exposure=SimpleNamespace(mid_time=time)))
+    return SimpleNamespace(stamp=time, depth=SimpleNamespace(exposure=SimpleNamespace(mid_time=time)))
 
 
 TRUTH = hand_held(3)
 BEFORE = motion(TRUTH, 0.5)
 STATE = np.diag(np.repeat([0.01, 0.01, 0.1, 0.1], 3) ** 2)
 AT_END: Any = SimpleNamespace(
-    known=lambda: (SimpleNamespace(spline=TRUTH), REF), found=SimpleNamespace(end=0.5), is_modelled=False,
+    known=lambda: (SimpleNamespace(spline=TRUTH), REF), found=SimpleNamespace(end=0.5, stamps=[0.5]), is_modelled=False,
     has_gyro=False,
     covariances=SimpleNamespace(uncertainty=Uncertainty(state=STATE), considered=lambda _: None),
 )  # fmt: skip
