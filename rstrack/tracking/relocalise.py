@@ -91,8 +91,8 @@ class Relocaliser:
         """Where a frame was taken that follows a track's last ones, or why it is not known.
 
         Small images are aligned to some keyframes, and the whole one from the best of these poses; others take their
-        turn with the next frame, or at once where an IMU has led nearby. A pose that no hand can have brought the
-        camera to is none until the next frame is found beside it. T_led (4, 4): where an IMU has it.
+        turn with the next frame, or at once where an IMU has led nearby. A pose that does not follow from the motion
+        before is none until the next frame is found beside it. T_led (4, 4): where an IMU has it.
         """
         jump, self._jump = self._jump, None
         starts = [(jump.ref, jump.T_ref_cam)] if jump else self._searched(track, new, T_led)

@@ -204,7 +204,7 @@ class TrackState:
             o.count_as(1.0 / self.independence[not o.is_depth].inflation)
 
     def scatters(self, o: Observation) -> bool:
-        """Whether an image's rows scatter by as much more than usual as a whole one may not."""
+        """Whether the gradients of an image's rows scatter about the spline `GROWTH` times as much as usual."""
         return o.inflation > GROWTH**2 * self.independence[not o.is_depth].inflation
 
     def learn(self, found: Match, excess: float, new: DeviceFrame) -> None:
