@@ -280,3 +280,12 @@ def test_two_states_contradict_each_other_as_seldom_as_the_level_says() -> None:
 
 def replace_velocity(state: Prediction) -> Prediction:
     return Prediction(state.t, state.T_world_depth, state.velocity + 50.0, state.covariance)
+
+
+def test_an_innovation_of_a_start_that_diverged_is_a_number() -> None:
+    """Regression: before a bare wall one of 10⁹ σ ended the run with SciPy's error, since rounding hid the limit."""
+    rng, R = np.random.default_rng(5), 1e-6 * np.eye(12)
+    for size in np.repeat(10.0 ** np.arange(2, 14), 20):
+        off = 1e-3 * size * rng.normal(size=12)
+        found = weighed([image(True, R, off)], at_rest()[0], predicted(R))
+        assert found.inflation == pytest.approx(off @ off / 1e-6 / LIMIT, rel=2e-2)
