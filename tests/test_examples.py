@@ -220,7 +220,7 @@ def test_what_survives_the_clock_gives_the_same_bits_without_it() -> None:
 
 
 def test_the_live_loop_says_what_it_dropped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root, clock = synthetic.make_sequence(tmp_path / "seq", frames=6), Clock()
+    root, clock = synthetic.make_sequence(tmp_path / "seq", frames=9), Clock()
     words = [str(root), "--method", "rs-g", "--seconds", "0.3", "--hz", "30", "--check"]
     load("live_loop").main(words, clock, clock.sleep)
     first, second, third = capsys.readouterr().out.splitlines()

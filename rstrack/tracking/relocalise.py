@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from rsgen.array_types import FloatArray
 from rsgen.geometry import se3
 from rstrack.alignment.observation import matched_brightness
@@ -80,6 +82,8 @@ class Relocaliser:
     def __init__(self) -> None:
         self._lost_in_a_row = 0
         self._jump: _Jump | None = None
+        # Stamp of the last frame that was found though its pose does not follow from the motion before.
+        self._jumped = -np.inf
 
     def reset(self) -> None:
         """The camera has been found."""
@@ -108,10 +112,14 @@ class Relocaliser:
         mid = new.depth.exposure.mid_time
         T_found = found.window.spline.pose(mid)
         if jump and not implausible(jump.ref.T_world_base @ jump.T_ref_cam, T_found, mid - jump.time):
+            self._jumped = new.stamp
             return found, verdict
-        if not _follows(track, found):
+        # Where the frame before did not follow either, stamps lie, or rows: then the motion says nothing of this one.
+        is_led = self._jumped != track.found.stamps[-1]
+        if not (_is_near(track, found) and (not is_led or _follows(track, found))):
             self._jump = _Jump(found.ref, se3.inverse(found.ref.T_world_base) @ T_found, mid)
             return Fault.UNCONFIRMED
+        self._jumped = self._jumped if is_led else new.stamp
         return found, verdict
 
     def _searched(
@@ -153,16 +161,20 @@ class Relocaliser:
         return found, judge_unpredicted(track, found)
 
 
+def _is_near(track: TrackState, found: Match) -> bool:
+    """Whether a hand may have moved the camera to a pose since the last one."""
+    end, mid = track.found.end, found.frame.depth.exposure.mid_time
+    return not implausible(track.known()[0].spline.pose(end), found.window.spline.pose(mid), mid - end)
+
+
 def _follows(track: TrackState, found: Match) -> bool:
-    """Whether a pose follows from the last ones: no further than a hand moves a camera, and as their velocity has it.
+    """Whether pose and velocity follow from the last ones, by the covariances of both.
 
     By itself an image may be off in its velocity, and in its pose with it, as where it is blurred otherwise than its
     keyframe. Under the wrong shutter, or beside a gyroscope, images are not held against a prediction.
     """
     (window, ref), state, mid = track.known(), found.window.state, found.frame.depth.exposure.mid_time
-    end, uncertainty = track.found.end, track.covariances.uncertainty
-    if implausible(window.spline.pose(end), state.spline.pose(mid), mid - end):
-        return False
+    uncertainty = track.covariances.uncertainty
     if track.has_gyro or not track.is_modelled:
         return True
     now = by_images(found.fresh, state, track.covariances.considered(0.0), uncertainty.systematic.median_inflation)

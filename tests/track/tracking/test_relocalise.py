@@ -168,9 +168,12 @@ def test_what_is_found_again_has_to_follow_from_the_motion_before_or_be_found_tw
     said = Prediction(time, T_found, BEFORE[1] + velocity * np.eye(6)[0], STATE)
     monkeypatch.setattr(relocalise, "by_images", lambda *_: said)
     monkeypatch.setattr(AT_END, "is_modelled", True)
-    relocaliser = Sees([T_found] * 2)
+    relocaliser = Sees([T_found] * 3)
     assert looked(relocaliser, time) is is_found
     assert is_found or looked(relocaliser, time + 0.033)
+    # After a jump, and until a frame is found where the motion leads, the motion before says nothing.
+    monkeypatch.setattr(AT_END.found, "stamps", [0.5, time + 0.033])
+    assert is_found or looked(relocaliser, time + 0.066)
 
 
 def test_given_time_a_camera_may_be_anywhere() -> None:
