@@ -277,11 +277,11 @@ def _inflation(off: FloatArray, P: FloatArray, R: FloatArray) -> float:
     def beyond(s: float) -> float:
         return float((y2 / (spread + s)).sum()) - _LIMIT
 
+    if beyond(1.0) <= 0.0:
+        return 1.0
+    # Within the limit there, but for rounding: an innovation of 10⁹ σ, as of a start that diverged, may not be.
     most = 1.0 + float(y2.sum()) / _LIMIT
-    if beyond(1.0) <= 0.0 or beyond(most) >= 0.0:
-        # An innovation of 10⁹ σ, as of a start that diverged, is within the limit at `most` but for rounding.
-        return 1.0 if beyond(1.0) <= 0.0 else most
-    return float(brentq(beyond, 1.0, most, rtol=1e-6))
+    return most if beyond(most) >= 0.0 else float(brentq(beyond, 1.0, most, rtol=1e-6))
 
 
 def _measured(
