@@ -4,7 +4,7 @@
 
 As with a camera, one frame waits at most, and a newer one takes its place. Frames are decoded before the clock starts,
 and kernels compiled. A recording that is shorter than that is played forth and back; on the way back the lines of a
-rolling shutter run backwards in time as well, so that poses are worse there.
+rolling shutter run backwards in time as well, so that poses are worse there, and some frames are lost.
 
 Without --budget-ms the clock decides which frames survive, and nothing else: the survivors fed again without a clock
 give the same bits (--check).
