@@ -36,7 +36,7 @@ from rstrack.calibration.parameters import (
 )
 from rstrack.calibration.solve import Solution
 from rstrack.data.dataset import Dataset
-from rstrack.data.rig import sigma_of_file
+from rstrack.data.rig import UNSTATED_POSE, sigma_of_file
 
 _OPPOSITE: dict[str, Scan] = {
     "top-bottom": "bottom-top", "bottom-top": "top-bottom", "left-right": "right-left", "right-left": "left-right",
@@ -175,7 +175,10 @@ class CameraCalibration:
         }  # fmt: skip
 
     def stated_sigmas(self) -> dict[str, float]:
-        """σ of what was found, as a camera file has them: of each kind the largest, lenses' by the colour camera's."""
+        """σ of what was found, as a camera file has them: of each kind the largest, lenses' by the colour camera's.
+
+        Extrinsics that were not found are known as well as before.
+        """
         lens = [f"color.{name}" for name in LENS]
         kinds = {
             "focal": (lens[:2], 1.0), "aspect": (lens[:2], 1.0), "center_px": (lens[2:4], self.cameras()[1].fx),
@@ -189,6 +192,8 @@ class CameraCalibration:
             at = [NAMES.index(name) for name in names]
             if self.asked[at].all() and not self.undetermined[at].any():
                 found[kind] = float(f"{factor * self.sigmas[at].max():.3g}")
+            elif kind in UNSTATED_POSE and (before := getattr(self.dataset.rig.sigma, kind)):
+                found[kind] = before
         if "focal" in found:
             # What depth images seemed to be off by, each as a whole, came with a lens that was wrong.
             found["depth_image"] = 0.0

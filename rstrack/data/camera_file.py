@@ -241,7 +241,8 @@ def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
         depth_shutter, late_s, notes = _depth_shutter(depth, depth_camera, color_shutter)
     except (UserError, ValidationError) as error:
         raise UserError(f"{path}: {_first(error) if isinstance(error, ValidationError) else error}") from None
-    sigma = sigma_of_file(color_camera, data.sigma.model_dump(exclude_none=True))
+    has_pose = data.T_color_depth is not None or depth is None
+    sigma = sigma_of_file(color_camera, data.sigma.model_dump(exclude_none=True), has_pose)
     falloff = None if data.color.falloff == "auto" else data.color.falloff
     rig = Rig(depth_camera, depth_shutter, color_camera, color_shutter, T_color_depth, falloff, sigma)
     color_offset_s = None if data.color.offset_s == "auto" else data.color.offset_s

@@ -81,12 +81,22 @@ UNDISTORTED_K1 = 0.1
 """σ of k1 where a real lens is stated to have no distortion, as it hardly ever is."""
 
 
-def sigma_of_file(camera: Camera, stated: Mapping[str, float] | None = None) -> CalibrationSigma:
-    """How far a camera file may be wrong that states these σ, by the names that it has for them. camera: colour's."""
+UNSTATED_POSE = {"translation_m": 0.025, "rotation_deg": 1.0}
+"""σ of T_color_depth where it is left out, though the cameras are two: they stand 15 to 60 mm apart in one housing."""
+
+
+def sigma_of_file(
+    camera: Camera, stated: Mapping[str, float] | None = None, has_pose: bool = True
+) -> CalibrationSigma:  # fmt: skip
+    """How far a camera file may be wrong that states these σ, by the names that it has for them.
+
+    camera: colour's. has_pose: whether the file states T_color_depth.
+    """
     found = dict(stated or {})
     if "center_px" in found:
         found["center"] = found.pop("center_px") / camera.fx
-    return replace(DEFAULT_SIGMA if any(camera.distortion) else replace(DEFAULT_SIGMA, k1=UNDISTORTED_K1), **found)
+    unstated = {} if any(camera.distortion) else {"k1": UNDISTORTED_K1}
+    return replace(DEFAULT_SIGMA, **(unstated | ({} if has_pose else UNSTATED_POSE) | found))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from rstrack.calibration.solve import Solution
 from rstrack.cli.main import main
 from rstrack.data.camera_file import read_rig
 from rstrack.data.dataset import Dataset, open_dataset
-from rstrack.data.rig import DepthError
+from rstrack.data.rig import EXACT_SIGMA, DepthError
 from rstrack.data.timing import Timing, stream_timing
 
 pytestmark = pytest.mark.usefixtures("few_pairs")
@@ -118,6 +118,10 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     assert another.color_offset_s is None and another.color_drift == 0.0
     text = (tmp_path / "camera.yaml").read_text()
     assert "±" in text and "undetermined, kept" in text
+    # Extrinsics that were not found are known as badly as they were.
+    vague = replace(shaken, rig=replace(shaken.rig, sigma=replace(EXACT_SIGMA, rotation_deg=1.0, translation_m=0.02)))
+    still = replace(made, dataset=vague).stated_sigmas()
+    assert still["translation_m"] == 0.02 and still["rotation_deg"] < 0.1
     parameters = made.as_dict()["parameters"]
     assert parameters["T_color_depth.y"]["sigma"] is None and parameters["color.offset_s"]["sigma"] > 0.0
 

@@ -25,6 +25,7 @@ from rstrack.data.rig import (
     DEFAULT_SIGMA,
     EXACT_SIGMA,
     UNDISTORTED_K1,
+    UNSTATED_POSE,
     CalibrationSigma,
     Frame,
     Image,
@@ -165,6 +166,16 @@ def test_a_camera_file_states_what_it_knows_and_the_rest_is_as_usual(tmp_path: P
     assert read(tmp_path, "", "").sigma == replace(DEFAULT_SIGMA, k1=UNDISTORTED_K1)
     stated = read(tmp_path, bent, "sigma: {focal: 0.002, center_px: 1.5}").sigma
     assert stated == replace(DEFAULT_SIGMA, focal=0.002, center=0.003)
+
+
+def test_extrinsics_that_are_left_out_may_be_as_far_off_as_housings_are_wide(tmp_path: Path) -> None:
+    apart = "depth: {width: 640, height: 480, intrinsics: [585.0, 585.0, 319.5, 239.5], readout_s: 0}\n"
+    bent = ", model: radtan, distortion: [0.1, 0.0, 0.0, 0.0]"
+    beside = "T_color_depth: [[1, 0, 0, 0.02], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    assert read(tmp_path, bent, apart).sigma == replace(DEFAULT_SIGMA, **UNSTATED_POSE)
+    assert read(tmp_path, bent, apart + beside).sigma == DEFAULT_SIGMA
+    stated = read(tmp_path, bent, apart + "sigma: {rotation_deg: 0.1}").sigma
+    assert stated.rotation_deg == 0.1 and stated.translation_m == UNSTATED_POSE["translation_m"]
 
 
 def test_a_run_keeps_the_sigmas_that_it_went_by(tmp_path: Path) -> None:
