@@ -27,6 +27,8 @@ ERRORS = ("ate_mm", "drift_mm_s", "drift_deg_s")
 _DOT = " · "
 _NUMBERED = re.compile(r"(\D+)(\d*)")
 _SIDE_BY_SIDE, _MOST_COLUMNS = 12, 10
+# Commits of records that are named one by one.
+_LISTED = 3
 
 
 @dataclass(frozen=True)
@@ -244,17 +246,20 @@ def write_tables(
 
 
 def provenance(records: Iterable[CellRecord]) -> str:
-    """Version, commit, dates, machine, how many cells."""
-    made = list(records)
+    """Versions, commits (of many the oldest and the newest), dates, machines, how many cells."""
+    made = sorted(records, key=lambda record: record.date)
 
     def each(values: Iterable[str | None]) -> str:
         return ", ".join(dict.fromkeys(value for value in values if value)) or "?"
 
+    commits = list(dict.fromkeys(record.commit for record in made if record.commit))
+    if len(commits) > _LISTED:
+        commits = [f"{commits[0]} to {commits[-1]} ({len(commits)} commits: each record names its own)"]
     dates = sorted({record.date[:10] for record in made if record.date})
     machines = each(f"{r.machine.get('cpu', '?')}, {r.machine.get('cores', '?')} cores" for r in made if r.machine)
     load = max((float(record.machine.get("load") or 0.0) for record in made), default=0.0)
     return (
-        f"version {each(r.version for r in made)}, commit {each(r.commit for r in made)}, "
+        f"version {each(r.version for r in made)}, commit {each(commits)}, "
         f"{' to '.join(dict.fromkeys((dates[0], dates[-1]))) if dates else '?'}; {machines}, load before at most "
         f"{load:.3g}; {len(made)} cells."
     )

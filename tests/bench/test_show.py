@@ -27,6 +27,7 @@ from benchmarks.show import (
 from benchmarks.verdicts import beaten, sentences
 from rsgen.errors import UserError
 from rstrack.bench.record import CellRecord, read_records, write_records
+from rstrack.bench.tables import provenance
 
 HAND_HELD = ("robot_t1", "robot_t2", "robot_r1", "robot_r2", "table1", "table2")
 LIVING_ROOM = ("lr_kt0", "lr_kt1", "lr_kt2", "lr_kt3")
@@ -256,3 +257,13 @@ def test_numbers_in_names_are_in_their_order(full: dict[str, CellRecord], gate: 
 
 def test_groups_are_those_of_the_paper() -> None:
     assert PAPERS_GROUPS == ("hand-held", "living room")
+
+
+def test_where_records_are_from_is_named_one_by_one_while_they_are_few() -> None:
+    made = [
+        CellRecord(f"a/{k}", "", {}, (0,), ({},), True, version="1.0", commit=f"c{k}", date=f"2026-01-{9 - k:02d}T00")
+        for k in range(5)
+    ]
+    assert "commit c2, c1, c0, 2026-01-07 to 2026-01-09;" in provenance(made[:3])
+    many = provenance(made)
+    assert "commit c4 to c0 (5 commits: each record names its own), 2026-01-05" in many and "5 cells." in many
