@@ -62,20 +62,19 @@ def match(
     solve(hopeless)
     if not is_settled(found.solved) and not is_hopeless(fresh):
         found.again()
-    fitting = without_misfits(fresh, ref)
+    fitting = without_misfits(fresh, ref, track.scales)
     if len(fitting) < len(fresh) and not is_hopeless(found.on_reference):
         found.window, found.fresh, found.whole = begin(), fitting, False
         solve(None)
     return found
 
 
-def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) -> Verdict:
-    """Whether a frame was found where the motion led; gap: s since the one before.
+def judge_predicted(track: TrackState, found: Match, young: bool, all_fit: bool) -> Verdict:
+    """Whether a frame was found where the motion led. all_fit: only if all of its images fit.
 
-    young: its segment of the spline has just begun, and predicts little: all of its images have to fit. A rolling
-    reference moves with what is aligned to it, and does not bind the two. A gyroscope sees how rows move within an
-    image that vibrates, which the filter does not. Under the wrong shutter all images are off. In these cases no
-    prediction is held against them.
+    young: its segment of the spline has just begun, and predicts little. A rolling reference moves with what is aligned
+    to it, and does not bind the two. A gyroscope sees how rows move within an image that vibrates, which the filter
+    does not. Under the wrong shutter all images are off. In these cases no prediction is held against them.
     """
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
@@ -94,14 +93,16 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
-        # An image that fits far worse than the last ones may show another place: the prediction does not hold then. Of
-        # one sensor its noise may be the cause, as on what is far away; where both are odd nothing is known.
+        # A depth image that fits far worse than the last ones may show another place, as the colours do that were left
+        # out where depth contradicts the prediction, too: that does not hold then. Noise may be the cause, as on what
+        # is far away; where nothing fits as usual nothing is known.
         odd = track.scales.exceeded(on_reference)
-        if not fault and (1 < len(odd) == len(on_reference) or (young and (odd or not found.whole))):
+        nothing_fits = len(odd) == len(on_reference) and (len(odd) > 1 or not found.whole)
+        if not fault and (nothing_fits or (all_fit and (odd or not _fits(track, found)))):
             fault = Fault.MISFIT
         if not rolls:
             seen = score.information
-            if weighs and odd:
+            if weighs and (odd or (not found.whole and innovation.inflation > 1.0)):
                 uncertainty = uncertainty.found_anew(seen)
             else:
                 uncertainty = uncertainty.after(seconds, seen, *accelerations)
@@ -121,7 +122,7 @@ def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) ->
             uncertainty = replace(uncertainty, mixture=more)
     if not fault:
         track.scales.learn(on_reference)
-        if implausible(T_predicted, window.spline.pose(mid), gap):
+        if implausible(T_predicted, window.spline.pose(mid), seconds):
             fault = Fault.MOTION
     return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
 
@@ -140,11 +141,16 @@ def unfinished(solved: Solved, state: SplineState, t: float) -> FloatArray:
     return np.concatenate([off, np.zeros(6)])
 
 
+def _fits(track: TrackState, found: Match) -> bool:
+    """Whether a frame was found by all of its images, and does not vibrate, which the spline does not follow."""
+    return found.whole and not all(track.scatters(o) for o in found.on_reference)
+
+
 def judge_unpredicted(track: TrackState, found: Match) -> Verdict:
-    """Whether a frame was found where nothing led: not where it vibrates, which the spline does not follow."""
+    """Whether a frame was found where nothing led."""
     state = found.window.state
     verdict = judge_alone(track.scales, track.covariances, found.fresh, found.solved, state, found.ref.pixels)
-    if not found.whole or all(track.scatters(o) for o in found.fresh):
+    if not _fits(track, found):
         verdict = replace(verdict, fault=Fault.MISFIT)
     if not verdict.fault:
         track.scales.learn(found.fresh)
@@ -172,13 +178,14 @@ def judge_alone(
     return Verdict(fault or _unknown(uncertainty), score, uncertainty, covariances.common)
 
 
-def without_misfits(fresh: list[Observation], ref: Reference) -> list[Observation]:
-    """What is left to align by if a frame's colour images do not fit, or its depth has none to show.
+def without_misfits(fresh: list[Observation], ref: Reference, scales: RunningScales) -> list[Observation]:
+    """What is left to align by if a frame's colours do not fit, or not as they usually do, or its depth shows nothing.
 
     Where depth does not fit either, the colours may be what drew it away.
     """
     on_reference = [o for o in fresh if o.ref.index == ref.index]
-    unfit = [o for o, _ in misfits(on_reference, ref.pixels)]
+    odd = [o for o in scales.exceeded(on_reference) if not o.is_depth]
+    unfit = odd + [o for o, _ in misfits(on_reference, ref.pixels) if o not in odd]
     empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
     odd_colors = [o for o in unfit if not o.is_depth]
     if odd_colors and len(odd_colors) < len(on_reference) and not empty:

@@ -220,6 +220,17 @@ def test_just_found_before_a_wall_a_frame_of_other_colours_may_be_anywhere(elsew
     np.testing.assert_allclose(x[-1] - x[0], 0.25, atol=3e-3)
 
 
+@pytest.mark.parametrize(("was_blank", "nearer"), [(False, 0.0), (True, 0.0), (False, 0.06)])
+def test_colours_are_left_out_only_where_all_else_agrees_with_the_motion_before(was_blank: bool, nearer: float) -> None:
+    """Regression: a jump along a table top passed by depth alone, 0.75 m off, after two lost frames."""
+    tracker = Tracker(Rig(CAMERA, GLOBAL, CAMERA, GLOBAL, np.eye(4)), Options(method="gs-pg"))
+    for k in range(14):
+        is_blank, is_odd = k == 10 and was_blank, k == 11
+        z, color = (at_a_wall(k)[0] - nearer * is_odd) * (not is_blank), at_a_wall(k, is_odd)[1] * (not is_blank)
+        report = tracker.feed(Frame(Image(k / 30, z.astype(np.float32)), (Image(k / 30, color),)))
+        assert report.lost == (is_blank or (is_odd and (was_blank or nearer > 0.0))), (k, report.fault)
+
+
 @pytest.mark.parametrize("is_odd", [True, False])
 def test_where_an_image_fits_far_worse_than_usual_the_motion_before_does_not_make_a_pose_known(is_odd: bool) -> None:
     """Regression: a pose that no image determined was given, 0.1 m off; as good an image as usual may be led."""
