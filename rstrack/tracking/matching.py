@@ -69,12 +69,13 @@ def match(
     return found
 
 
-def judge_predicted(track: TrackState, found: Match, young: bool, all_fit: bool) -> Verdict:
-    """Whether a frame was found where the motion led. all_fit: only if all of its images fit.
+def judge_predicted(track: TrackState, found: Match, gap: float, young: bool) -> Verdict:
+    """Whether a frame was found where the motion led; gap: s since the one before, or since where an IMU leads from.
 
-    young: its segment of the spline has just begun, and predicts little. A rolling reference moves with what is aligned
-    to it, and does not bind the two. A gyroscope sees how rows move within an image that vibrates, which the filter
-    does not. Under the wrong shutter all images are off. In these cases no prediction is held against them.
+    young: its segment of the spline has just begun, and predicts little: all of its images have to fit, as where the
+    frame before was lost. A rolling reference moves with what is aligned to it, and does not bind the two. A gyroscope
+    sees how rows move within an image that vibrates, which the filter does not. Under the wrong shutter all images are
+    off. In these cases no prediction is held against them.
     """
     new, fresh, window = found.frame, found.fresh, found.window
     uncertainty, common = track.covariances.uncertainty, track.covariances.common
@@ -93,16 +94,15 @@ def judge_predicted(track: TrackState, found: Match, young: bool, all_fit: bool)
     with track.terms.timer("judgement"):
         score = scores(on_reference, window.state)
         fault = lost(on_reference, found.solved, found.ref.pixels)
-        # A depth image that fits far worse than the last ones may show another place, as the colours do that were left
-        # out where depth contradicts the prediction, too: that does not hold then. Noise may be the cause, as on what
-        # is far away; where nothing fits as usual nothing is known.
+        # A depth image that fits far worse than the last ones may show another place: the prediction does not hold
+        # then. Noise may be the cause, as on what is far away; where nothing fits as usual nothing is known.
         odd = track.scales.exceeded(on_reference)
         nothing_fits = len(odd) == len(on_reference) and (len(odd) > 1 or not found.whole)
-        if not fault and (nothing_fits or (all_fit and (odd or not _fits(track, found)))):
+        if not fault and (nothing_fits or ((young or seconds > gap) and (odd or not _fits(track, found)))):
             fault = Fault.MISFIT
         if not rolls:
             seen = score.information
-            if weighs and (odd or (not found.whole and innovation.inflation > 1.0)):
+            if weighs and odd:
                 uncertainty = uncertainty.found_anew(seen)
             else:
                 uncertainty = uncertainty.after(seconds, seen, *accelerations)
@@ -122,7 +122,7 @@ def judge_predicted(track: TrackState, found: Match, young: bool, all_fit: bool)
             uncertainty = replace(uncertainty, mixture=more)
     if not fault:
         track.scales.learn(on_reference)
-        if implausible(T_predicted, window.spline.pose(mid), seconds):
+        if implausible(T_predicted, window.spline.pose(mid), gap):
             fault = Fault.MOTION
     return Verdict(fault or _unknown(uncertainty), score, uncertainty, common)
 

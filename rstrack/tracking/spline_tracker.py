@@ -85,20 +85,20 @@ class Tracker:
             track.terms.pace.lift()
             report = start(track, new) if track.window is None else bootstrap(track, new)
         elif self._bridge.leads(track, new):
-            report = self._follow(new, led=True)
+            report = self._follow(new, stamp - track.found.stamps[-1], led=True)
         elif stamp - track.found.stamps[-1] > _GAP_S:
             track.terms.pace.lift()
             report = self._relocalise(new)
         else:
-            report = self._follow(new)
+            report = self._follow(new, gap)
         track.reports.append(report)
         track.terms.pace.end()
         return report
 
-    def _follow(self, new: DeviceFrame, led: bool = False) -> FrameReport:
-        """Predict, match, test, fuse, renew the keyframe; led: by an IMU, over frames that were not found."""
+    def _follow(self, new: DeviceFrame, gap: float, led: bool = False) -> FrameReport:
+        """Predict, match, test, fuse, renew the keyframe: a frame `gap` s after the one before; led: by an IMU."""
         track = self.track
-        (before, ref), gap = track.known(), new.stamp - track.found.stamps[-1]
+        before, ref = track.known()
         young = before.segment_start > 0 and track.age < _YOUNG
 
         def predict() -> Window:
@@ -110,8 +110,7 @@ class Tracker:
         fresh = track.observe(new, ref) + ([] if anchor is None else track.observe(new, anchor))
         levels = LEVELS if young or gap > (_LED_S if led else _SURE_S) else TRACKING_LEVELS
         found = match(track, predict, new, ref, fresh, levels, track.succession.recent[-1].depth)
-        all_fit = young or (track.reports[-1].lost and not led)
-        verdict = judge_predicted(track, found, young, all_fit)
+        verdict = judge_predicted(track, found, gap, young)
         if verdict.fault:
             return self._search(found, verdict.fault, gap, led)
         self._bridge.close(track)
