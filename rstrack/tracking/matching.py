@@ -184,13 +184,12 @@ def without_misfits(fresh: list[Observation], ref: Reference, scales: RunningSca
     Where depth does not fit either, the colours may be what drew it away.
     """
     on_reference = [o for o in fresh if o.ref.index == ref.index]
-    odd = [o for o in scales.exceeded(on_reference) if not o.is_depth]
-    unfit = odd + [o for o, _ in misfits(on_reference, ref.pixels) if o not in odd]
+    unfit = [o for o, _ in misfits(on_reference, ref.pixels)]
+    odd = {id(o.image): o for o in (*unfit, *scales.exceeded(on_reference)) if not o.is_depth}
     empty = [o for o in fresh if isinstance(o.image, DepthImage) and o.image.count == 0]
-    odd_colors = [o for o in unfit if not o.is_depth]
-    if odd_colors and len(odd_colors) < len(on_reference) and not empty:
-        return [o for o in fresh if all(o.image is not odd.image for odd in odd_colors)]
-    if empty and len(unfit) == 1 and unfit[0].is_depth:
+    if odd and len(odd) < len(on_reference) and not empty:
+        return [o for o in fresh if id(o.image) not in odd]
+    if empty and unfit and not odd:
         return [o for o in fresh if not o.is_depth]
     return fresh
 

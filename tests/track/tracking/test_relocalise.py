@@ -39,6 +39,13 @@ def seen(kind: str, fit: float = 1.0, sigma: float = 1e-3) -> Any:
     return SimpleNamespace(is_depth=kind == "depth", is_linearised=True, lin=lin, pixels=5000, ref=REF, image=image)
 
 
+class Incomparable(SimpleNamespace):
+    def __eq__(self, _: object) -> bool:
+        raise ValueError("ambiguous")
+
+    __hash__ = object.__hash__
+
+
 @pytest.mark.parametrize("depth_fit", [1.0, 0.3])
 def test_colours_that_do_not_fit_are_left_out_whatever_depth_does(depth_fit: float) -> None:
     depth, odd, good = seen("depth", depth_fit), seen("color", 0.1), seen("color")
@@ -60,6 +67,9 @@ def test_colours_that_fit_far_worse_than_the_last_ones_did_are_left_out_beside_d
     odd = seen("color", sigma=0.08)
     assert without_misfits([depth, odd], REF, scales) == [depth]
     assert without_misfits([odd], REF, scales) == [odd]
+    # Of several beside one depth image each is judged on its own; what is on the device can't be compared.
+    both = [Incomparable(**vars(one)) for one in (odd, seen("color", 0.1))]
+    assert [o is depth for o in without_misfits([depth, *both], REF, scales)] == [True]
     # Noise grows with distance: a depth image that fits worse is judged with its colours, not dropped.
     noisy = seen("depth", sigma=0.05)
     assert without_misfits([noisy, color], REF, scales) == [noisy, color]
