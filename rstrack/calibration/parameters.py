@@ -149,7 +149,8 @@ class Parameters:
     @property
     def error(self) -> DepthError:
         """The depth camera's error."""
-        return DepthError(*(float(x) for x in self.depth_error))
+        offset_m, inverse_offset, radial = (float(x) for x in self.depth_error)
+        return DepthError(offset_m, inverse_offset, radial)
 
 
 def changed(camera: Camera, lens: FloatArray) -> Camera:

@@ -183,10 +183,12 @@ def camera_file_of(calibration: CameraCalibration) -> str:
     depth = _stream("depth", depth_camera, rig.depth_shutter, found.depth_readout_s, scans[0], beside[DEPTH_LENS])
     depth[-1] += beside[0]
     depth.append(f"  depth_scale: {dataset.depth_scale:g}")
-    error = calibration.values.depth_error
-    if error.any():
+    error, pattern = calibration.values.depth_error, dataset.depth_error.pattern
+    if error.any() or pattern is not None:
         names = zip(DEPTH, error, beside[DEPTH_ERROR], strict=True)
         depth += ["  error:", *(f"    {name}: {value:.7g}{comment}" for name, value, comment in names)]
+    if pattern is not None:
+        depth.append(f"    pattern: [{', '.join(f'{x:.6f}' for x in pattern)}]")
     axes = ", ".join(f"{UNKNOWNS[i].label.split(', ')[1]}{beside[i][3:]}" for i in range(COUNT)[EXTRINSICS])
     poses = ["T_color_depth:" + (f"  # {axes}" if calibration.asked[EXTRINSICS].any() else "")]
     poses += ["  - [" + ", ".join(f"{x:.12g}" for x in row) + "]" for row in found.T_color_depth]

@@ -95,7 +95,9 @@ class CameraCalibration:
             T_color_depth=found.T_color_depth,
             sigma=sigma_of_file(color, self.stated_sigmas()),
         )
-        found_dataset = replace(self.dataset, rig=rig, depth_error=found.error)
+        found_dataset = replace(
+            self.dataset, rig=rig, depth_error=replace(found.error, pattern=self.dataset.depth_error.pattern)
+        )
         return found_dataset.with_color_offset(found.color_offset_s, drift=found.color_drift)
 
     def text(self) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import astuple, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -26,13 +26,26 @@ from rstrack.calibration.figures import motion_of, pace_of, residuals_at, residu
 from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.trust import trust_in
 from rstrack.calibration.pairs.window import RecordingWindow
-from rstrack.calibration.parameters import COLOR_LENS, DEPTH_LENS, DRIFT, GROUPS, LENSES, Known, Parameters, free_of
+from rstrack.calibration.parameters import (
+    COLOR_LENS,
+    DEPTH,
+    DEPTH_LENS,
+    DRIFT,
+    GROUPS,
+    LENSES,
+    Known,
+    Parameters,
+    free_of,
+)
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.solve import solve
 from rstrack.calibration.stages import StageResult, in_stages, progress_watch
 from rstrack.calibration.start import TrackedSpline, first_track, load_window
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
+from rstrack.tracking.first_look import wants_pattern
+from rstrack.tracking.first_look.depth_pattern import FoundPattern, estimate_depth_pattern
+from rstrack.tracking.first_look.rough_track import GeometricTrack
 
 # Frames of a window, the fewest that one may have, and how many windows there are at least and at most.
 _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
@@ -75,6 +88,11 @@ def calibrate(
     before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
     start = before.values
     track = first_track(dataset, chosen, options, progress)
+    finds_pattern = wants_pattern(dataset)
+    if finds_pattern:
+        runs = track.frames(dataset, chosen)
+        pattern = _pattern_of(dataset, runs, [track.spline] * len(runs), progress)
+        dataset = dataset.with_depth_pattern(pattern.pattern)
     parts = _windows(dataset, chosen, track)
     free = _free(dataset, groups, parts)
     terms = PairTerms(e, dataset, free)
@@ -110,9 +128,24 @@ def calibrate(
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
     both, seconds = (residuals, residuals_now(some_of(stage.windows))), time.perf_counter() - begun
-    return CameraCalibration(
+    found = CameraCalibration(
         dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, keeps_file_lens
     )
+    if not finds_pattern:
+        return found
+    # Seen through the lens that was found.
+    seen, splines = found.calibrated().with_depth_pattern(()), [window.spline for window in stage.windows]
+    pattern = _pattern_of(seen, parts, splines, progress)
+    dataset = dataset.with_depth_pattern(pattern.pattern)
+    return replace(found, dataset=dataset, device_notes=(*found.device_notes, pattern.text()))
+
+
+def _pattern_of(
+    dataset: Dataset, runs: Sequence[range], splines: Sequence[Spline], progress: Progress
+) -> FoundPattern:  # fmt: skip
+    """What its depth images are off by alike, by frames that were followed, and the spline of each run of these."""
+    tracks = [GeometricTrack(run, s, s.t_begin, s.t_end) for run, s in zip(runs, splines, strict=True)]
+    return estimate_depth_pattern(dataset, tracks, progress)
 
 
 def _loaded(
@@ -163,7 +196,7 @@ def parameters_of(dataset: Dataset) -> Parameters:
     rig = dataset.rig
     offset = 0.0 if dataset.timing is None else dataset.timing.color_offset_s or 0.0
     readouts = rig.depth_shutter.readout_s, rig.color_shutter.readout_s
-    error = np.array(astuple(dataset.depth_error))
+    error = np.array([getattr(dataset.depth_error, name) for name in DEPTH])
     T = rig.T_color_depth
     return Parameters(*readouts, offset, dataset.color_drift, T, dataset.middle, depth_error=error)
 

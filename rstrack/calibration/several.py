@@ -68,9 +68,14 @@ def together(found: Sequence[CameraCalibration]) -> CameraCalibration:
         for each, (_, _, K) in zip(found, reduced, strict=True)
     }
     asked = np.logical_or.reduce([each.asked for each in found]) & ~_CLOCK
+    patterns = [each.dataset.depth_error.pattern for each in found if each.dataset.depth_error.pattern]
+    dataset = first.dataset
+    if patterns:
+        dataset = dataset.with_depth_pattern(tuple(float(x) for x in np.mean(patterns, axis=0)))
     return replace(
-        first, solution=solution, asked=asked, parts=tuple(part for each in found for part in each.parts),
-        seconds=sum(each.seconds for each in found), clocks=clocks,
+        first, dataset=dataset, solution=solution, asked=asked,
+        parts=tuple(part for each in found for part in each.parts), clocks=clocks,
+        seconds=sum(each.seconds for each in found),
         keeps_file_lens=all(each.keeps_file_lens for each in found),
     )  # fmt: skip
 

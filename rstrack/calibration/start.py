@@ -26,6 +26,7 @@ from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
 from rstrack.data.dataset import Dataset
+from rstrack.data.rig import DepthError
 from rstrack.images.pyramid import in_range, intensity, pyramid
 from rstrack.options import Method, Options
 from rstrack.tracking.first_look.rough_track import rough_track
@@ -164,7 +165,9 @@ def _view(terms: PairTerms, dataset: Dataset, k: int) -> WindowFrame:
 
 
 def _surface(dataset: Dataset, k: int, max_depth: float) -> DepthSurface:
-    z, rig = dataset.images.depth(k), dataset.rig
+    # The rest of depth's error is among what is looked for.
+    pattern, rig = DepthError(pattern=dataset.depth_error.pattern), dataset.rig
+    z = pattern.corrected(dataset.images.depth(k), rig.depth_camera)
     rho = averaged(np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=(z > 0.0) & (z < max_depth)))
     baseline = _BASELINE_M + float(np.linalg.norm(rig.T_color_depth[:3, 3]))
     return surface_of(rho, rig.depth_camera.fx, rig.depth_camera.fy, baseline)

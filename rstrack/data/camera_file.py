@@ -32,6 +32,7 @@ from rsgen.files import read_text, read_yaml
 from rsgen.geometry.camera import Camera, Model
 from rsgen.geometry.shutter import Scan, Shutter
 from rsgen.sequence.format import DEPTH_SCALE
+from rstrack.data.depth_pattern import PATTERN_SIZE
 from rstrack.data.estimate import read_info
 from rstrack.data.foreign_camera_files import Camchain, is_camchain, is_opencv, opencv_content, read_camchain
 from rstrack.data.registration import registered_shutter
@@ -135,6 +136,21 @@ class _DepthError(_Entry):
     offset_m: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     inverse_offset: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     radial: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    pattern: tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...] | Literal["auto"] = "auto"
+
+    @model_validator(mode="after")
+    def _has_all_of_a_pattern(self) -> _DepthError:
+        if self.pattern != "auto" and len(self.pattern) not in (0, PATTERN_SIZE):
+            raise ValueError(
+                f"pattern has {len(self.pattern)} values: give the {PATTERN_SIZE} that 'rstrack calibrate' writes, [] "
+                "for a depth camera without one, or auto"
+            )
+        return self
+
+    @property
+    def value(self) -> DepthError:
+        pattern = None if self.pattern == "auto" else self.pattern
+        return DepthError(self.offset_m, self.inverse_offset, self.radial, pattern)
 
 
 class _DepthStream(_CameraStream):
@@ -218,13 +234,14 @@ def camera_content(file: RigFile) -> dict[str, Any]:
         lens = {"intrinsics": intrinsics, "model": camera.model, "distortion": list(camera.distortion)}
         return {"width": camera.width, "height": camera.height} | lens | asdict(shutter)
 
-    rig, sigma = file.rig, asdict(file.rig.sigma)
+    rig, sigma, error = file.rig, asdict(file.rig.sigma), asdict(file.depth_error)
+    error["pattern"] = "auto" if error["pattern"] is None else list(error["pattern"])
     sigma["center_px"] = sigma.pop("center") * rig.color_camera.fx
     offset = {} if file.color_offset_s is None else {"offset_s": file.color_offset_s}
     return {
         "color": stream(rig.color_camera, rig.color_shutter) | offset | {"drift_ppm": 1e6 * file.color_drift},
         "depth": stream(rig.depth_camera, rig.depth_shutter)
-        | {"offset_s": file.depth_offset_s, "depth_scale": file.depth_scale, "error": asdict(file.depth_error)},
+        | {"offset_s": file.depth_offset_s, "depth_scale": file.depth_scale, "error": error},
         "T_color_depth": rig.T_color_depth.tolist(),
         "stamps": file.stamps,
     } | ({} if rig.sigma.is_exact else {"sigma": sigma})
@@ -256,7 +273,7 @@ def _of_content(path: Path, content: Mapping[str, Any]) -> RigFile:
         return file
     return replace(
         file, depth_scale=depth.depth_scale, scale_named="depth_scale" in depth.model_fields_set,
-        depth_offset_s=late_s + depth.offset_s, depth_error=DepthError(**depth.error.model_dump()),
+        depth_offset_s=late_s + depth.offset_s, depth_error=depth.error.value,
     )  # fmt: skip
 
 

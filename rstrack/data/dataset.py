@@ -185,6 +185,14 @@ class Dataset:
         rig = replace(self.rig, color_falloff=falloff)
         return replace(self, rig=rig, notes=(*self.notes, note) if note else self.notes)
 
+    def with_depth_pattern(self, pattern: tuple[float, ...], note: str = "") -> Dataset:
+        """The same recording with a depth camera that is known to be off by this pattern, see `DepthError`.
+
+        note: for the screen, where that comes from.
+        """
+        error = replace(self.depth_error, pattern=pattern)
+        return replace(self, depth_error=error, notes=(*self.notes, note) if note else self.notes)
+
     def seen_with(self, rig: Rig) -> Dataset:
         """The same images taken for those of other cameras, of as many pixels, whose colour may have an offset."""
         if self.timing is not None:

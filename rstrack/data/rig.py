@@ -17,6 +17,7 @@ from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
 from rsgen.limits import rigid
+from rstrack.data.depth_pattern import pattern_image
 
 _ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
 _LENS = "focal", "aspect", "cx", "cy", "k1"
@@ -101,22 +102,25 @@ def sigma_of_file(
 
 @dataclass(frozen=True)
 class DepthError:
-    """True depth is 1 / (1 / z + inverse_offset + radial r²) + offset_m.
+    """True depth is 1 / (1 / z + pattern(x, y) + inverse_offset + radial r²) + offset_m.
 
     z: as measured, m; r: of the pixel's ray, in normalised coordinates. inverse_offset and radial in 1/m: an error of
     the disparity of structured light, whose effect grows with z² (Teichman et al., RSS 2013); offset_m: of time of
-    flight.
+    flight. pattern (27,): coefficients, 1/m, see `rstrack.data.depth_pattern`; (): none; None: not known.
     """
 
     offset_m: float = 0.0
     inverse_offset: float = 0.0
     radial: float = 0.0
+    pattern: tuple[float, ...] | None = None
 
     def corrected(self, z: Float32Array, camera: Camera) -> Float32Array:
         """True planar z (h, w) in m of what the camera measured; 0, and what would lie beyond infinity, is 0."""
         if self == NO_DEPTH_ERROR:
             return z
         bent = np.float32(self.inverse_offset) + np.float32(self.radial) * _squared_radius(camera)
+        if self.pattern:
+            bent = bent + pattern_image(self.pattern, camera.width, camera.height)
         inverse = np.divide(np.float32(1), z, out=np.zeros_like(z), where=z > 0) + bent
         found = (z > 0) & (inverse > 0)
         true = np.divide(np.float32(1), inverse, out=np.zeros_like(z), where=found) + np.float32(self.offset_m)

@@ -171,7 +171,8 @@ def _asked(dataset: Dataset, free: BoolArray) -> Asked:
     color = tuple(name for name, asked in zip(LENS, free[COLOR_LENS], strict=True) if asked)
     depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
     depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
-    return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or dataset.depth_error != NO_DEPTH_ERROR, one)
+    has_error = replace(dataset.depth_error, pattern=None) != NO_DEPTH_ERROR
+    return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or has_error, one)
 
 
 def _pair_sums(raw: IntArray, scaling: Scaling, pairs: IntArray, count: int, unit: FloatArray, apart: bool) -> PairSums:

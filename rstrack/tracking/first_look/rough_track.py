@@ -173,7 +173,7 @@ def rests(dataset: Dataset, spline: Spline, p_world: FloatArray, k: int) -> npt.
     """Which of points (n, 3) depth image k shows where they were: not what moves by itself, or what it hides."""
     camera, shutter = dataset.rig.depth_camera, dataset.rig.depth_shutter
     times = shutter.line_mid_time(dataset.stamps[k], np.arange(shutter.line_count(camera)), camera)
-    uv, p_cam, _ = _projected(camera, shutter, se3.inverse(spline.pose(times)), p_world)
+    uv, p_cam, _ = projected(camera, shutter, se3.inverse(spline.pose(times)), p_world)
     seen = camera.contains(uv)
     u, v = np.rint(np.where(seen[:, None], uv, 0.0)).astype(np.int64).T
     z = dataset.depth(k)[np.minimum(v, camera.height - 1), np.minimum(u, camera.width - 1)]
@@ -181,7 +181,7 @@ def rests(dataset: Dataset, spline: Spline, p_world: FloatArray, k: int) -> npt.
     return np.asarray(seen & (z > 0.0) & (off < _SAME_M + _SAME * p_cam[:, 2]))
 
 
-def _projected(
+def projected(
     camera: Camera,
     shutter: Shutter,
     T_cam_world: FloatArray,
@@ -221,7 +221,7 @@ def pixels_of(dataset: Dataset, spline: Spline, p_world: FloatArray, stamps: Flo
     found = np.empty((len(stamps), len(p_world), 2), np.float32)
     for m, stamp in enumerate(stamps):
         T = T_color_depth @ se3.inverse(spline.pose(shutter.line_mid_time(stamp, lines, camera)))
-        uv, _, line = _projected(camera, shutter, T, p_world, line)
+        uv, _, line = projected(camera, shutter, T, p_world, line)
         found[m] = np.where(camera.contains(uv)[:, None], 0.5 * uv, -10.0)
     return found
 
