@@ -38,7 +38,7 @@ from rstrack.calibration.solve import Solution
 from rstrack.data.dataset import Dataset
 from rstrack.data.rig import UNSTATED_POSE, sigma_of_file
 
-_OPPOSITE: dict[str, Scan] = {
+OPPOSITE: dict[str, Scan] = {
     "top-bottom": "bottom-top", "bottom-top": "top-bottom", "left-right": "right-left", "right-left": "left-right",
 }  # fmt: skip
 
@@ -50,7 +50,7 @@ class CameraCalibration:
     residuals: of a few windows, with the values before along the first track, and with those found. pace: by the first
     track. device_notes: what became of what is published of the device, if one was named. keeps_file_lens: another lens
     was asked for, but explains the images no better than the file's. clocks: of several recordings together, by their
-    folders' names, offset (s) and drift of each one's colour; else empty.
+    folders' names, offset (s) and drift of each one's colour; else empty. pattern_note: what depth is off by alike.
     """
 
     dataset: Dataset
@@ -65,6 +65,7 @@ class CameraCalibration:
     device_notes: tuple[str, ...] = ()
     keeps_file_lens: bool = False
     clocks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    pattern_note: str = ""
 
     @property
     def undetermined(self) -> BoolArray:
@@ -234,7 +235,7 @@ class CameraCalibration:
         """Of depth and colour; the opposite of what was assumed where the readout turned out negative."""
         rig, p = self.dataset.rig, self.values
         pairs = (rig.depth_shutter, p.depth_readout_s), (rig.color_shutter, p.color_readout_s)
-        depth, color = (_OPPOSITE[s.scan] if readout < 0.0 else s.scan for s, readout in pairs)
+        depth, color = (OPPOSITE[s.scan] if readout < 0.0 else s.scan for s, readout in pairs)
         return depth, color
 
     def upright(self) -> Parameters:
@@ -250,7 +251,7 @@ class CameraCalibration:
 
     def notes(self) -> list[str]:
         """What a user should know of the clocks and the directions."""
-        notes = list(self.device_notes)
+        notes = [*self.device_notes, *([self.pattern_note] if self.pattern_note else [])]
         for name, scan, before, readout, sigma in zip(
             ("depth", "colour"), self.scans(), (self.dataset.rig.depth_shutter, self.dataset.rig.color_shutter),
             (self.values.depth_readout_s, self.values.color_readout_s), self.sigmas[:2], strict=True,

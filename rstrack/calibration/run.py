@@ -21,6 +21,7 @@ from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Scan
 from rsgen.geometry.spline import Spline
+from rstrack.calibration.depth_pattern import pattern_by
 from rstrack.calibration.devices import Device, device_notes
 from rstrack.calibration.figures import motion_of, pace_of, residuals_at, residuals_now, some_of
 from rstrack.calibration.pairs.terms import PairTerms
@@ -44,8 +45,6 @@ from rstrack.calibration.start import TrackedSpline, first_track, load_window
 from rstrack.data.dataset import Dataset
 from rstrack.options import Options
 from rstrack.tracking.first_look import wants_pattern
-from rstrack.tracking.first_look.depth_pattern import FoundPattern, estimate_depth_pattern
-from rstrack.tracking.first_look.rough_track import GeometricTrack
 
 # Frames of a window, the fewest that one may have, and how many windows there are at least and at most.
 _FRAMES, _FEWEST_FRAMES, _FEWEST, _MOST = 30, 14, 3, 12
@@ -88,11 +87,6 @@ def calibrate(
     before = device.known(parameters_of(dataset)) if device else Known.nothing(parameters_of(dataset))
     start = before.values
     track = first_track(dataset, chosen, options, progress)
-    finds_pattern = wants_pattern(dataset)
-    if finds_pattern:
-        runs = track.frames(dataset, chosen)
-        pattern = _pattern_of(dataset, runs, [track.spline] * len(runs), progress)
-        dataset = dataset.with_depth_pattern(pattern.pattern)
     parts = _windows(dataset, chosen, track)
     free = _free(dataset, groups, parts)
     terms = PairTerms(e, dataset, free)
@@ -107,6 +101,12 @@ def calibrate(
     coarse = solve(rough, terms, start, free, _COARSE, progress_watch(progress, 0.15), known)
     windows = [replace(each, is_rough=False) for each in rough]
     stage = StageResult(windows, coarse, True, False)
+    finds_pattern = coarse.finished and wants_pattern(dataset)
+    if finds_pattern:
+        pattern = pattern_by(dataset, parts, windows, coarse.values, progress)
+        dataset = dataset.with_depth_pattern(pattern.pattern)
+        again = _loaded(dataset, terms, parts, track.spline, start, options, progress)
+        windows = [replace(each, images=new.images) for each, new in zip(windows, again, strict=True)]
     if coarse.finished:
         kept = _trusted(dataset, windows, terms, coarse.values)
         parts, windows = [parts[k] for k in kept], [windows[k] for k in kept]
@@ -133,19 +133,10 @@ def calibrate(
     )
     if not finds_pattern:
         return found
-    # Seen through the lens that was found.
-    seen, splines = found.calibrated().with_depth_pattern(()), [window.spline for window in stage.windows]
-    pattern = _pattern_of(seen, parts, splines, progress)
+    # Through the lens that was found.
+    pattern = pattern_by(dataset, parts, stage.windows, solution.values, progress)
     dataset = dataset.with_depth_pattern(pattern.pattern)
-    return replace(found, dataset=dataset, device_notes=(*found.device_notes, pattern.text()))
-
-
-def _pattern_of(
-    dataset: Dataset, runs: Sequence[range], splines: Sequence[Spline], progress: Progress
-) -> FoundPattern:  # fmt: skip
-    """What its depth images are off by alike, by frames that were followed, and the spline of each run of these."""
-    tracks = [GeometricTrack(run, s, s.t_begin, s.t_end) for run, s in zip(runs, splines, strict=True)]
-    return estimate_depth_pattern(dataset, tracks, progress)
+    return replace(found, dataset=dataset, pattern_note=pattern.text())
 
 
 def _loaded(

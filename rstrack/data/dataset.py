@@ -217,8 +217,8 @@ class Dataset:
         return camera_content(RigFile(self.rig, self.depth_scale, *clocks, depth_error=self.depth_error))
 
     def as_seen_by(self, info: dict[str, Any]) -> Dataset:
-        """The same recording with colour's offset, darker corners and the IMU's description as a run had them in the
-        end, whose run.json holds `info`."""
+        """The same recording with depth's pattern, colour's offset, darker corners and the IMU's description as a run
+        had them in the end, whose run.json holds `info`."""
         clocks, recorded, late = (info.get(name) for name in ("clocks", "dataset", "color_late"))
         offset_s = clocks.get("color_offset_s") if self.timing is not None and isinstance(clocks, dict) else None
         late_s = late.get("seconds") if isinstance(late, dict) else None
@@ -228,6 +228,9 @@ class Dataset:
         imu_file = recorded.get("imu_file") if isinstance(recorded, dict) else None
         if isinstance(imu_file, str) and self.imu_files is not None and self.imu_files.given is None:
             timed = timed.with_imu_file(Path(imu_file))
+        pattern = recorded.get("depth_pattern") if isinstance(recorded, dict) else None
+        if self.depth_error.pattern is None and isinstance(pattern, list):
+            timed = timed.with_depth_pattern(tuple(float(x) for x in pattern))
         falloff = recorded.get("color_falloff") if isinstance(recorded, dict) else None
         if self.rig.color_falloff is not None or not isinstance(falloff, float | int):
             return timed

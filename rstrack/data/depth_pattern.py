@@ -22,6 +22,9 @@ PATTERN_SIZE = len(_POWERS)
 Without a constant: one of all images alike is an error of depth's scale, which images do not show.
 """
 
+MEAN_SQUARES = np.array([1.0 / ((2 * i + 1) * (2 * j + 1)) for i, j in _POWERS])
+"""Of the polynomials (27,) over an image; any two of them are orthogonal there."""
+
 
 def pattern_basis(uv: npt.ArrayLike, width: int, height: int) -> FloatArray:
     """The polynomials (n, 27) at pixels (n, 2); the middles of the outermost pixels of an image are at ± 1."""

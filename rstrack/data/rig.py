@@ -114,9 +114,14 @@ class DepthError:
     radial: float = 0.0
     pattern: tuple[float, ...] | None = None
 
+    @property
+    def is_none(self) -> bool:
+        """Whether depth is taken as it was measured."""
+        return not any((self.offset_m, self.inverse_offset, self.radial, self.pattern))
+
     def corrected(self, z: Float32Array, camera: Camera) -> Float32Array:
         """True planar z (h, w) in m of what the camera measured; 0, and what would lie beyond infinity, is 0."""
-        if self == NO_DEPTH_ERROR:
+        if self.is_none:
             return z
         bent = np.float32(self.inverse_offset) + np.float32(self.radial) * _squared_radius(camera)
         if self.pattern:

@@ -21,7 +21,7 @@ from rstrack.calibration.pairs.kernels import ColorPairInput, DepthPairInput, co
 from rstrack.calibration.pairs.optics import Asked, Optics, camera_table, units
 from rstrack.calibration.parameters import COLOR_LENS, DEPTH, DEPTH_ERROR, DEPTH_LENS, LENS, Parameters, changed
 from rstrack.data.dataset import Dataset
-from rstrack.data.rig import NO_DEPTH_ERROR, DepthError
+from rstrack.data.rig import DepthError
 
 # Part of σ by which the averaging may have bent a pixel's surface.
 _SMOOTH = 0.25
@@ -171,7 +171,7 @@ def _asked(dataset: Dataset, free: BoolArray) -> Asked:
     color = tuple(name for name, asked in zip(LENS, free[COLOR_LENS], strict=True) if asked)
     depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
     depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
-    has_error = replace(dataset.depth_error, pattern=None) != NO_DEPTH_ERROR
+    has_error = not replace(dataset.depth_error, pattern=None).is_none
     return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or has_error, one)
 
 

@@ -10,8 +10,7 @@ from rstrack.options import Options
 
 def wants_pattern(dataset: Dataset) -> bool:
     """Whether its depth may be off by a pattern that nothing states: a real camera, or one rendered like one."""
-    may_be_off = dataset.timing is not None and bool(dataset.rig.sigma.depth_inverse_offset)
-    return may_be_off and dataset.depth_error.pattern is None
+    return dataset.depth_error.pattern is None and bool(dataset.rig.sigma.depth_inverse_offset)
 
 
 def looked_at(dataset: Dataset, chosen: range, options: Options, progress: Progress) -> Dataset:

@@ -29,7 +29,7 @@ from rsgen.array_types import BoolArray, FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
 from rstrack.data.dataset import Dataset
-from rstrack.data.depth_pattern import PATTERN_SIZE, pattern_basis
+from rstrack.data.depth_pattern import MEAN_SQUARES, PATTERN_SIZE, pattern_basis
 from rstrack.tracking.first_look.rough_track import GeometricTrack, projected
 
 # For the progress bar.
@@ -38,8 +38,8 @@ _STAGE = "depth's pattern"
 _EVERY, _APART = 5, (1, 2, 4, 8)
 # Pixels compared in a line of an image.
 _ACROSS = 80
-# A surface: so many pixels across, nearly all of them measured, flat but for so much inverse depth (1/m).
-_ACROSS_SURFACE, _MEASURED, _FLAT = 9, 0.99, 0.004
+# A surface: so many of them in a line of an image, nearly all of it measured, as flat as half of them but for a factor.
+_SURFACES, _MEASURED, _FLAT = 71, 0.99, 3.0
 # Inverse depth (1/m) that is compared, and how far two images may differ there before one hides the other.
 _FARTHEST, _SAME = 0.2, 0.05
 # The fewest pixels that a pair may share, pairs, and groups of these that scatter.
@@ -71,13 +71,12 @@ class FoundPattern:
     @property
     def rms(self) -> float:
         """Of the pattern over the image, 1/m."""
-        return float(np.sqrt(np.mean((_over_image() @ np.array(self.pattern)) ** 2)))
+        return float(np.sqrt(MEAN_SQUARES @ np.array(self.pattern) ** 2))
 
     @property
     def sigma_rms(self) -> float:
         """Of its standard error over the image, 1/m."""
-        basis = _over_image()
-        return float(np.sqrt(np.einsum("ni,ij,nj->n", basis, self.covariance, basis).mean()))
+        return float(np.sqrt(MEAN_SQUARES @ np.diag(self.covariance)))
 
 
 def estimate_depth_pattern(
@@ -112,7 +111,8 @@ class _Surface:
 
 @dataclass(frozen=True)
 class _Pair:
-    """Residuals r (n,), 1/m, and their derivatives by the pattern (n, 27) and by a twist of b against a (n, 6)."""
+    """Residuals r (n,), 1/m, and their derivatives by the pattern (n, 27) and by a twist (n, 6) of b
+    about where its middle line was taken, in the world's axes."""
 
     r: FloatArray
     by_pattern: FloatArray
@@ -142,20 +142,22 @@ def _pairs(dataset: Dataset, track: GeometricTrack, progress: Progress) -> list[
 
 def _surface(z: npt.NDArray[np.float32], T_world_depth: FloatArray) -> _Surface:
     """A plane of inverse depth through the pixels about each, by least squares."""
-    half = _ACROSS_SURFACE // 2
+    half = max(1, z.shape[1] // (2 * _SURFACES))
+    across = 2 * half + 1
     rho = np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=z > 0.0)
-    size = (_ACROSS_SURFACE, _ACROSS_SURFACE)
+    size = (across, across)
     mean, square = (cv2.boxFilter(image, cv2.CV_32F, size) for image in (rho, rho * rho))
     measured = cv2.boxFilter((z > 0.0).astype(np.float32), cv2.CV_32F, size)
     along = np.arange(-half, half + 1, dtype=np.float32)
     moment = float((along**2).mean())
-    even = np.full(_ACROSS_SURFACE, 1.0 / _ACROSS_SURFACE, np.float32)
-    slope = along / (_ACROSS_SURFACE * moment)
+    even = np.full(across, 1.0 / across, np.float32)
+    slope = along / (across * moment)
     slope_x, slope_y = cv2.sepFilter2D(rho, cv2.CV_32F, slope, even), cv2.sepFilter2D(rho, cv2.CV_32F, even, slope)
     rest = square - mean**2 - moment * (slope_x**2 + slope_y**2)
-    inside = np.zeros(z.shape, bool)
-    inside[half:-half, half:-half] = True
-    smooth = inside & (measured > _MEASURED) & (rest < _FLAT**2) & (mean > _FARTHEST)
+    known = np.zeros(z.shape, bool)
+    known[half:-half, half:-half] = True
+    known &= (measured > _MEASURED) & (mean > _FARTHEST)
+    smooth = known & (rest <= _FLAT**2 * np.median(rest[known])) if known.any() else known
     return _Surface(mean, slope_x, slope_y, smooth, T_world_depth)
 
 
@@ -192,7 +194,7 @@ def _pair(dataset: Dataset, rays: FloatArray, a: _Surface, b: _Surface) -> _Pair
     by_rho = -(by_world * along).sum(axis=1)
     size = camera.width, camera.height
     by_pattern = by_rho[:, None] * pattern_basis(pixels[keep], *size) - pattern_basis(uv, *size)
-    lever = p_world[keep] - p_world[keep].mean(axis=0)
+    lever = p_world[keep] - b.T_world_depth[len(b.T_world_depth) // 2, :3, 3]
     return _Pair(r, by_pattern, np.hstack([by_world, np.cross(lever, by_world)]))
 
 
@@ -241,9 +243,3 @@ def _overcounted(H: FloatArray, g: FloatArray) -> float:
     rest = g_of - H_of @ np.linalg.solve(total, g_of.sum(axis=0))
     M = rest.T @ rest * _GROUPS / (_GROUPS - 1.0)
     return max(1.0, float(np.trace(np.linalg.solve(total, M))) / PATTERN_SIZE)
-
-
-def _over_image() -> FloatArray:
-    """The polynomials (n, 27) at points all over an image."""
-    at = np.linspace(0.0, 1.0, 33)
-    return pattern_basis(np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2), 2, 2)

@@ -107,7 +107,8 @@ def settings(dataset: Dataset, chosen: range, options: Options, noise: Noise) ->
         "dataset": {
             "name": dataset.name, "path": str(dataset.root.resolve()),
             "frames": [chosen.start, chosen.stop], "frames_in_all": len(dataset),
-            "color_falloff": dataset.rig.color_falloff, "camera": dataset.cameras, **notes,
+            "color_falloff": dataset.rig.color_falloff,
+            "depth_pattern": dataset.depth_error.pattern, "camera": dataset.cameras, **notes,
         },
     }  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,15 +16,29 @@ from rstrack.calibration.parameters import COUNT, NAMES, Parameters
 from rstrack.calibration.result import CameraCalibration
 from rstrack.calibration.several import check_alike, together
 from rstrack.calibration.solve import Solution
+from rstrack.data.rig import DepthError
 
 START = Parameters(0.03, 0.03, 0.0, 0.0, np.eye(4))
 AT = [NAMES.index(name) for name in ("color.readout_s", "color.offset_s", "color.fx", "color.cx")]
 READOUT, OFFSET, FX, CX = AT
 
 
+@dataclass(frozen=True)
+class Recorded:
+    """What a dataset has of its camera here."""
+
+    name: str
+    rig: Any
+    depth_error: DepthError
+
+    def with_depth_pattern(self, pattern: tuple[float, ...]) -> Recorded:
+        return replace(self, depth_error=DepthError(pattern=pattern))
+
+
 def calibrated(
-    name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, rng: np.random.Generator
-) -> CameraCalibration:
+    name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, rng: np.random.Generator,
+    pattern: tuple[float, ...] | None = None,
+) -> CameraCalibration:  # fmt: skip
     """A recording whose eight windows bear out `true` (31,), though it has ended at `own`."""
     free = np.isin(np.arange(COUNT), AT)
     root = rng.standard_normal((8, 4, 4)) * sure[:, None]
@@ -32,7 +46,7 @@ def calibrated(
     b = A @ (own - true)[free] + 0.01 * (A @ rng.standard_normal((8, 4, 1)))[..., 0] * 1e-3
     solution = Solution(START.moved(own), free, A, b, 0.0, 1e-3, 1e-2)
     shutter = SimpleNamespace(scan="top-bottom")
-    dataset: Any = SimpleNamespace(name=name, rig=SimpleNamespace(color_shutter=shutter))
+    dataset: Any = Recorded(name, SimpleNamespace(color_shutter=shutter), DepthError(pattern=pattern))
     unused: Any = None
     return CameraCalibration(dataset, START, solution, free, (range(30),), unused, 1.0, unused, unused)
 
@@ -46,11 +60,12 @@ def test_recordings_tell_what_the_others_do_not_and_keep_their_clocks() -> None:
         true[OFFSET] = clocks[k]
         own = true.copy()
         own[(CX, FX)[k]] = 0.0  # what this one does not tell is where it was
-        found.append(calibrated(f"recording{k}", true, own, sure, rng))
+        found.append(calibrated(f"recording{k}", true, own, sure, rng, (0.01 * k, 0.02)))
     made = together(found)
     assert made.values.since(START)[[READOUT, FX, CX]] == pytest.approx(camera[[READOUT, FX, CX]], abs=2e-4)
     alone = found[0].solution.sigmas
     assert made.solution.sigmas[CX] < 0.01 * alone[CX] and made.solution.sigmas[READOUT] < alone[READOUT]
+    assert made.dataset.depth_error.pattern == (0.005, 0.02)
     assert not made.solution.free[OFFSET] and not made.asked[OFFSET] and len(made.parts) == 2
     for name, offset in zip(("recording0", "recording1"), clocks, strict=True):
         assert made.clocks[name] == (pytest.approx(offset, abs=2e-4), 0.0)

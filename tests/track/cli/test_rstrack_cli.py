@@ -148,7 +148,13 @@ def test_a_run_folder_holds_the_trajectory_and_what_made_it(place: Path, origina
     chosen = Options(fuse=True, knot_spacing_s=0.025, loops="end")
     assert info["options"] == dataclasses.asdict(chosen) and info["method"] == "rs-pg"
     where = str((original / "seq").resolve())
-    frames = {"frames": [0, FRAMES], "frames_in_all": FRAMES, "color_falloff": 0.0, "camera": None}
+    frames = {
+        "frames": [0, FRAMES],
+        "frames_in_all": FRAMES,
+        "color_falloff": 0.0,
+        "camera": None,
+        "depth_pattern": None,
+    }
     assert info["dataset"] == {"name": "synthetic", "path": where, **frames}
     assert set(info["versions"]) == {"rstrack", "numpy", "scipy", "numba", "drjit"} and info["backend"] in (
         "llvm",

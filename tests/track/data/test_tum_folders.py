@@ -30,6 +30,7 @@ from rstrack.data.dataset import open_dataset, open_tracked
 from rstrack.data.estimate import read_estimate, write_estimate
 from rstrack.data.image_files import repeated
 from rstrack.options import Options
+from rstrack.tracking.first_look import wants_pattern
 from rstrack.tracking.runs.record import Noise, settings
 
 
@@ -88,6 +89,16 @@ def test_registered_depth_keeps_its_rows_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.stamps - STAMPS, (16.0 - 2 * 11.5) * 0.03 / 48, atol=1e-6)
 
 
+def test_depths_pattern_is_whole_or_none_or_looked_for(tmp_path: Path) -> None:
+    for stated, held in (([], ()), ("auto", None), ([0.001] * 27, (0.001,) * 27)):
+        root = make_tum(tmp_path / str(stated)[:4], {"color": COLOR, "depth": COLOR | {"error": {"pattern": stated}}})
+        seen = open_dataset(root)
+        assert seen.depth_error.pattern == held and wants_pattern(seen) == (held is None)
+    write_camera(root, {"color": COLOR, "depth": COLOR | {"error": {"pattern": [0.1, 0.2]}}})
+    with pytest.raises(UserError, match=r"camera\.yaml: .*pattern has 2 values: give the 27"):
+        open_dataset(root)
+
+
 def test_a_sensor_without_registration_or_sight_is_refused(tmp_path: Path) -> None:
     sensor = {"width": 64, "height": 48, "intrinsics": [48.0, 50.0, 31.0, 23.0]}
     root = make_tum(tmp_path / "tum", {"color": COLOR, "depth": COLOR | {"sensor": sensor}})
@@ -116,7 +127,7 @@ def test_a_run_json_opens_the_folder_as_the_run_saw_it(tmp_path: Path) -> None:
     lens = {"model": "radtan", "distortion": [0.1, -0.05, 0.001, 0.002], "scan": "bottom-top", "exposure_s": 0.004}
     sensor = {"width": 64, "height": 48, "intrinsics": [48.0, 50.0, 31.0, 23.0]}
     moved = se3.exp(np.array([0.05, 0.01, 0.0, 0.02, -0.01, 0.03])).tolist()
-    error = {"offset_m": 0.01, "inverse_offset": 0.02, "radial": -0.01}
+    error = {"offset_m": 0.01, "inverse_offset": 0.02, "radial": -0.01, "pattern": [0.001 * n for n in range(27)]}
     asked: list[dict[str, Any]] = [
         {"depth": COLOR | lens | {"depth_scale": 1000, "error": error}, "T_color_depth": moved, "stamps": "regular"},
         {"depth": REGISTERED | {"sensor": sensor}, "stamps": "raw"},
