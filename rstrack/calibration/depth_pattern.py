@@ -1,7 +1,7 @@
-"""What depth is off by alike in all images, by the splines of a calibration's windows and the cameras found so far.
+"""The fixed pattern of depth's error, by the splines of a calibration's windows and the cameras found so far.
 
-Not by the first track: with a readout that is far off, images bend with the motion, and what bends in few images alike
-passes for a pattern.
+Not by the first track: where the readout is far off, images bend with the motion, which in a few images looks like a
+pattern.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ def pattern_by(
 
 
 def _depth_seen(dataset: Dataset, p: Parameters) -> Dataset:
-    """The dataset with a depth camera of these values. Lines that are read the other way round are so from the last
-    one's time on."""
+    """The dataset with a depth camera of these values. A negative readout is the opposite scan, begun earlier."""
     rig, shutter, readout_s = dataset.rig, dataset.rig.depth_shutter, p.depth_readout_s
     camera = changed(rig.depth_camera, p.color_lens if rig.is_registered else p.depth_lens)
     first_s = min(0.0, readout_s) * (1.0 - 1.0 / shutter.line_count(camera))

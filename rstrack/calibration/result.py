@@ -50,7 +50,7 @@ class CameraCalibration:
     residuals: of a few windows, with the values before along the first track, and with those found. pace: by the first
     track. device_notes: what became of what is published of the device, if one was named. keeps_file_lens: another lens
     was asked for, but explains the images no better than the file's. clocks: of several recordings together, by their
-    folders' names, offset (s) and drift of each one's colour; else empty. pattern_note: what depth is off by alike.
+    folders' names, offset (s) and drift of each one's colour; else empty. pattern_note: on depth's error.
     """
 
     dataset: Dataset

@@ -1,4 +1,4 @@
-"""What a depth camera's images are off by alike: a smooth pattern of inverse depth over the image, the same in each.
+"""The fixed pattern of a depth camera's error: a smooth map of inverse depth over the image, the same in each.
 
 It is what a maker's calibration of lens, projector and baseline leaves, about a tenth of a pixel of disparity (Herrera
 C. et al., PAMI 2012; Teichman et al., RSS 2013). Here it is a polynomial of the pixel.

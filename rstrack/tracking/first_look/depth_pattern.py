@@ -1,18 +1,16 @@
-"""What a depth camera's images are off by alike, from the recording itself.
+"""The fixed pattern of a depth camera's error, estimated from the recording itself.
 
 found = estimate_depth_pattern(dataset, GeometricTracks(dataset, range(len(dataset)), Options(), no_progress))
 dataset = dataset.with_depth_pattern(found.pattern)
 
-A surface that two images show at different places of the image has two errors there. With the inverse depth ρ of frame
-b's pixel, the point it makes, moved to frame a by the rough track, lies at pixel u and inverse depth 1/z; what a has
-there differs by
+Two images that show a surface at different pixels disagree about it. The point at pixel v and inverse depth ρ of frame
+b is moved to frame a by the rough track, where it has pixel u and inverse depth 1/z. The residual is
 
-    r = 1/z − ρ_a(u) = noise − (∂(r)/∂ρ) w(b's pixel) + w(u) − J ξ,
+    r = 1/z − ρ_a(u) = noise − (∂r/∂ρ) w(v) + w(u) − J ξ,
 
-w the pattern, a linear combination of polynomials, and ξ what the track has wrong between the two. ξ is eliminated,
-pair by pair; w is found by least squares with Student weights. A pair's pixels are not independent and a track is off
-for a while, so that σ are those of the scatter between sixths of the pairs, and what these do not determine stays near
-zero: the solution is shrunk towards a pattern of so much as such cameras have.
+w the pattern, a linear combination of polynomials, and ξ the track's error between the two frames. ξ is eliminated,
+pair by pair; w is found by least squares with Student weights and a prior. Pixels of a pair are not independent, nor
+are errors of a track from one pair to the next: the covariance is that of the scatter between sixths of the pairs.
 """
 
 from __future__ import annotations
@@ -28,6 +26,7 @@ import numpy.typing as npt
 from rsgen.array_types import BoolArray, FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rsgen.geometry import se3
+from rstrack.alignment.weights import NU
 from rstrack.data.dataset import Dataset
 from rstrack.data.depth_pattern import MEAN_SQUARES, PATTERN_SIZE, pattern_basis
 from rstrack.tracking.first_look.rough_track import GeometricTrack, projected
@@ -38,7 +37,8 @@ _STAGE = "depth's pattern"
 _EVERY, _APART = 5, (1, 2, 4, 8)
 # Pixels compared in a line of an image.
 _ACROSS = 80
-# A surface: so many of them in a line of an image, nearly all of it measured, as flat as half of them but for a factor.
+# A plane is fitted to a part of an image, so many in a line; it is a surface where nearly all of it was measured and its
+# residual is below so many times the median.
 _SURFACES, _MEASURED, _FLAT = 71, 0.99, 3.0
 # Inverse depth (1/m) that is compared, and how far two images may differ there before one hides the other.
 _FARTHEST, _SAME = 0.2, 0.05
@@ -46,8 +46,6 @@ _FARTHEST, _SAME = 0.2, 0.05
 _FEWEST_PIXELS, _FEWEST_PAIRS, _GROUPS = 400, 12, 6
 # σ of a coefficient (1/m), a tenth of a pixel of a Kinect's disparity, and of what a rough track is off by (m, rad).
 _SIGMA, _TRACK_SIGMA = 0.003, 0.02
-# Degrees of freedom of the weights, as of all residuals.
-_NU = 5.0
 _ROUNDS = 6
 
 
@@ -62,9 +60,9 @@ class FoundPattern:
     def text(self) -> str:
         """One line for the screen."""
         if not self.pattern:
-            return "no pattern of depth's error found (too few images overlap): taken for none"
+            return "no fixed pattern of depth's error found (too few images overlap): taken for none"
         return (
-            f"what depth is off by alike in all images was found from {self.pairs} pairs of them, "
+            f"fixed pattern of depth's error estimated from {self.pairs} pairs of images: "
             f"{1e3 * self.rms:.1f} ± {1e3 * self.sigma_rms:.1f} mm at 1 m (RMS)"
         )
 
@@ -111,8 +109,8 @@ class _Surface:
 
 @dataclass(frozen=True)
 class _Pair:
-    """Residuals r (n,), 1/m, and their derivatives by the pattern (n, 27) and by a twist (n, 6) of b
-    about where its middle line was taken, in the world's axes."""
+    """Residuals r (n,), 1/m, and their derivatives by the pattern (n, 27) and by a twist (n, 6) of frame b, in the
+    world's axes, about where its middle line was taken."""
 
     r: FloatArray
     by_pattern: FloatArray
@@ -205,7 +203,6 @@ def _solved(pairs: Sequence[_Pair]) -> tuple[FloatArray, FloatArray]:
     """The pattern (27,) and its covariance."""
     prior = np.eye(PATTERN_SIZE) / _SIGMA**2
     x, twists = np.zeros(PATTERN_SIZE), np.zeros((len(pairs), 6))
-    overcounts = 1.0
     A = prior
     for _ in range(_ROUNDS):
         parts = [_reduced(pair, x, twist) for pair, twist in zip(pairs, twists, strict=True)]
@@ -223,7 +220,7 @@ def _reduced(pair: _Pair, x: FloatArray, twist: FloatArray) -> tuple[FloatArray,
     follows (6, 27) a step of the pattern."""
     e = pair.r + pair.by_pattern @ x + pair.by_twist @ twist
     sigma = 1.4826 * np.median(np.abs(e)) + 1e-9
-    weight = (_NU + 1.0) / (_NU + (e / sigma) ** 2) / sigma**2
+    weight = (NU + 1.0) / (NU + (e / sigma) ** 2) / sigma**2
     J, T = pair.by_pattern, pair.by_twist
     WJ, WT = weight[:, None] * J, weight[:, None] * T
     cross = WJ.T @ T

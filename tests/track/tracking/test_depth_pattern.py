@@ -1,4 +1,4 @@
-"""What a depth camera is off by alike in all images, from images that were made wrong by so much."""
+"""The fixed pattern of a depth camera's error, from images that were made wrong by so much."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_only_where_depth_may_be_off_and_nothing_is_stated(shaken: Dataset) -> N
     assert not wants_pattern(shaken) and wants_pattern(faulty) and not wants_pattern(faulty.with_depth_pattern(()))
     assert looked_at(shaken, range(60), options, no_progress) is shaken
     seen = looked_at(faulty, range(60), options, no_progress)
-    assert seen.depth_error.pattern and "alike in all images" in seen.notes[-1]
+    assert seen.depth_error.pattern and "fixed pattern" in seen.notes[-1]
     before, after = (np.abs(d.depth(30) - shaken.depth(30)).mean() for d in (faulty, seen))
     assert after < 0.5 * before
     assert seen.color_stamps is faulty.color_stamps and seen.rig is faulty.rig
