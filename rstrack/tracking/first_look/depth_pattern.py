@@ -37,7 +37,7 @@ _STAGE = "depth's pattern"
 _EVERY, _APART = 5, (1, 2, 4, 8)
 # Pixels compared in a line of an image.
 _ACROSS = 80
-# A plane is fitted to a part of an image, so many in a line; it is a surface where nearly all of it was measured and its
+# A plane is fitted to a part of an image, so many in a line. It is a surface where nearly all of it is measured and its
 # residual is below so many times the median.
 _SURFACES, _MEASURED, _FLAT = 71, 0.99, 3.0
 # Inverse depth (1/m) that is compared, and how far two images may differ there before one hides the other.
