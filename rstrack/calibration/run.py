@@ -101,12 +101,6 @@ def calibrate(
     coarse = solve(rough, terms, start, free, _COARSE, progress_watch(progress, 0.15), known)
     windows = [replace(each, is_rough=False) for each in rough]
     stage = StageResult(windows, coarse, True, False)
-    finds_pattern = coarse.finished and wants_pattern(dataset)
-    if finds_pattern:
-        pattern = pattern_by(dataset, parts, windows, coarse.values, progress)
-        dataset = dataset.with_depth_pattern(pattern.pattern)
-        again = _loaded(dataset, terms, parts, track.spline, start, options, progress)
-        windows = [replace(each, images=new.images) for each, new in zip(windows, again, strict=True)]
     if coarse.finished:
         kept = _trusted(dataset, windows, terms, coarse.values)
         parts, windows = [parts[k] for k in kept], [windows[k] for k in kept]
@@ -131,9 +125,8 @@ def calibrate(
     found = CameraCalibration(
         dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, keeps_file_lens
     )
-    if not finds_pattern:
+    if not (solution.finished and wants_pattern(dataset)):
         return found
-    # Through the lens that was found.
     pattern = pattern_by(dataset, parts, stage.windows, solution.values, progress)
     dataset = dataset.with_depth_pattern(pattern.pattern)
     return replace(found, dataset=dataset, pattern_note=pattern.text())

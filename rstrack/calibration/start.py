@@ -165,7 +165,7 @@ def _view(terms: PairTerms, dataset: Dataset, k: int) -> WindowFrame:
 
 
 def _surface(dataset: Dataset, k: int, max_depth: float) -> DepthSurface:
-    # The rest of depth's error is among what is looked for.
+    # The rest of depth's error is among what is estimated.
     pattern, rig = DepthError(pattern=dataset.depth_error.pattern), dataset.rig
     z = pattern.corrected(dataset.images.depth(k), rig.depth_camera)
     rho = averaged(np.divide(np.float32(1.0), z, out=np.zeros_like(z), where=(z > 0.0) & (z < max_depth)))
