@@ -1,7 +1,7 @@
 """The fixed pattern of depth's error, by the splines of a calibration's windows and the cameras found.
 
-It is found last: a wrong lens, and in few images a wrong readout, look like a pattern, and a lens that is found with such
-a pattern taken off stays wrong.
+It is found last: a wrong lens, and in few images a wrong readout, look like a pattern, and a lens that is found with
+such a pattern taken off stays wrong.
 """
 
 from __future__ import annotations
