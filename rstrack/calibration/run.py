@@ -116,20 +116,22 @@ def calibrate(
             stage = staged(known, stage.solution.values)
     solution, keeps_file_lens = stage.solution, stage.keeps_file_lens
     free[LENSES] &= not keeps_file_lens
+    pattern_note = ""
+    if solution.finished and wants_pattern(dataset):
+        pattern = pattern_by(dataset, parts, stage.windows, solution.values, progress)
+        pattern_note = pattern.text()
+        if pattern.pattern:  # else it stays open, and 'track' looks for it
+            dataset = dataset.with_depth_pattern(pattern.pattern)
     progress("calibrating", 1.0, "done")
     free[DRIFT] &= stage.drifts
     motion = motion_of(dataset, parts, track.spline)
     notes = device_notes(device, before, known, solution.sigmas) if device else ()
     pace = pace_of(dataset, track.frames(dataset, chosen), track.spline)
     both, seconds = (residuals, residuals_now(some_of(stage.windows))), time.perf_counter() - begun
-    found = CameraCalibration(
-        dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, keeps_file_lens
-    )
-    if not (solution.finished and wants_pattern(dataset)):
-        return found
-    pattern = pattern_by(dataset, parts, stage.windows, solution.values, progress)
-    dataset = dataset.with_depth_pattern(pattern.pattern)
-    return replace(found, dataset=dataset, pattern_note=pattern.text())
+    return CameraCalibration(
+        dataset, start, solution, free, tuple(parts), motion, seconds, both, pace, notes, keeps_file_lens,
+        pattern_note=pattern_note,
+    )  # fmt: skip
 
 
 def _loaded(

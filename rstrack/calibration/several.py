@@ -69,11 +69,12 @@ def together(found: Sequence[CameraCalibration]) -> CameraCalibration:
     }
     asked = np.logical_or.reduce([each.asked for each in found]) & ~_CLOCK
     patterns = [each.dataset.depth_error.pattern for each in found if each.dataset.depth_error.pattern]
-    dataset = first.dataset
+    dataset, pattern_note = first.dataset, ""
     if patterns:
         dataset = dataset.with_depth_pattern(tuple(float(x) for x in np.mean(patterns, axis=0)))
+        pattern_note = f"fixed pattern of depth's error: the mean of those of {len(patterns)} recordings"
     return replace(
-        first, dataset=dataset, solution=solution, asked=asked,
+        first, dataset=dataset, pattern_note=pattern_note, solution=solution, asked=asked,
         parts=tuple(part for each in found for part in each.parts), clocks=clocks,
         seconds=sum(each.seconds for each in found),
         keeps_file_lens=all(each.keeps_file_lens for each in found),

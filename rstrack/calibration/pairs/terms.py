@@ -171,7 +171,7 @@ def _asked(dataset: Dataset, free: BoolArray) -> Asked:
     color = tuple(name for name, asked in zip(LENS, free[COLOR_LENS], strict=True) if asked)
     depth = color if one else tuple(name for name, asked in zip(LENS, free[DEPTH_LENS], strict=True) if asked)
     depth += tuple(name for name, asked in zip(DEPTH, free[DEPTH_ERROR], strict=True) if asked)
-    has_error = not replace(dataset.depth_error, pattern=None).is_none
+    has_error = any(getattr(dataset.depth_error, name) for name in DEPTH)
     return Asked(depth, color, bool(free[DEPTH_ERROR].any()) or has_error, one)
 
 

@@ -60,7 +60,7 @@ class FoundPattern:
     def text(self) -> str:
         """One line for the screen."""
         if not self.pattern:
-            return "no fixed pattern of depth's error found (too few images overlap): taken for none"
+            return "no fixed pattern of depth's error found: too few images overlap"
         return (
             f"fixed pattern of depth's error estimated from {self.pairs} pairs of images: "
             f"{1e3 * self.rms:.1f} ± {1e3 * self.sigma_rms:.1f} mm at 1 m (RMS)"

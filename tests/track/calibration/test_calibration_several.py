@@ -65,7 +65,7 @@ def test_recordings_tell_what_the_others_do_not_and_keep_their_clocks() -> None:
     assert made.values.since(START)[[READOUT, FX, CX]] == pytest.approx(camera[[READOUT, FX, CX]], abs=2e-4)
     alone = found[0].solution.sigmas
     assert made.solution.sigmas[CX] < 0.01 * alone[CX] and made.solution.sigmas[READOUT] < alone[READOUT]
-    assert made.dataset.depth_error.pattern == (0.005, 0.02)
+    assert made.dataset.depth_error.pattern == (0.005, 0.02) and "mean of those of 2" in made.pattern_note
     assert not made.solution.free[OFFSET] and not made.asked[OFFSET] and len(made.parts) == 2
     for name, offset in zip(("recording0", "recording1"), clocks, strict=True):
         assert made.clocks[name] == (pytest.approx(offset, abs=2e-4), 0.0)

@@ -11,6 +11,8 @@ from shaken_recording import FaultyDepth
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import no_progress
 from rsgen.geometry import se3
+from rstrack.calibration.depth_pattern import _depth_seen
+from rstrack.calibration.run import parameters_of
 from rstrack.data.dataset import Dataset
 from rstrack.data.depth_pattern import PATTERN_SIZE, pattern_basis, pattern_image
 from rstrack.data.rig import DEFAULT_SIGMA, DepthError
@@ -130,3 +132,13 @@ def test_none_leaves_every_bit_of_depth(shaken: Dataset) -> None:
         z = shaken.images.depth(0)
         np.testing.assert_allclose(error.corrected(z, shaken.rig.depth_camera), z, rtol=3e-7)
     assert DepthError(pattern=()).corrected(z, shaken.rig.depth_camera) is z
+
+
+def test_calibration_looks_for_it_at_the_times_of_its_lines(shaken: Dataset) -> None:
+    """A negative readout: lines are read the other way round, the first of the image when its stamp says."""
+    p = replace(parameters_of(shaken), depth_readout_s=-0.01)
+    seen = _depth_seen(shaken, p)
+    camera, shutter = seen.rig.depth_camera, seen.rig.depth_shutter
+    lines = np.arange(shutter.line_count(camera))
+    times = shutter.line_mid_time(seen.stamps[5], shutter.line_of_pixel([[0.0, y] for y in lines], camera), camera)
+    np.testing.assert_allclose(times - shaken.stamps[5], -0.01 * lines / len(lines), atol=1e-12)
