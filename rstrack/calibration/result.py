@@ -197,6 +197,13 @@ class CameraCalibration:
                 found[kind] = float(f"{factor * self.sigmas[at].max():.3g}")
             elif kind in UNSTATED_POSE and (before := getattr(self.dataset.rig.sigma, kind)):
                 found[kind] = before
+        center, tangential = [[NAMES.index(name) for name in names] for names in (lens[2:4], lens[6:8])]
+        if "center_px" in found and self.asked[tangential].all() and not self.undetermined[tangential].any():
+            # p1 and p2 trade with the principal point, whose σ holds that already: the rest, where it is known.
+            C = self.solution.covariance
+            both = C[np.ix_(center, tangential)]
+            rest = C[np.ix_(tangential, tangential)] - both.T @ np.linalg.solve(C[np.ix_(center, center)], both)
+            found["p"] = float(f"{np.sqrt(np.diag(rest).max()):.3g}")
         if "focal" in found:
             # What depth images seemed to be off by, each as a whole, came with a lens that was wrong.
             found["depth_image"] = 0.0

@@ -72,7 +72,8 @@ def _sigma(rig: Rig) -> str:
     apart = "" if rig.is_registered else f", extrinsics {1e3 * s.translation_m:.3g} mm {s.rotation_deg:.3g} degrees"
     return (
         f"focal length {100 * s.focal:.3g} %, aspect {100 * s.aspect:.3g} %, center {s.center * fx:.3g} px, "
-        f"k1 {s.k1:.3g}, readout {1e3 * s.readout_s:.3g} ms, clock {1e3 * s.offset_s:.3g} ms{apart}, "
+        f"k1 {s.k1:.3g}, p1 and p2 {s.p:.3g}, "
+        f"readout {1e3 * s.readout_s:.3g} ms, clock {1e3 * s.offset_s:.3g} ms{apart}, "
         f"depth {100 * s.depth_scale:.3g} % and {s.depth_inverse_offset:.3g}/m, each image {s.depth_image:.3g}/m "
         "(camera file: 'sigma')"
     )

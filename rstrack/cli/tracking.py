@@ -63,7 +63,7 @@ def track(
     from rstrack.calibration.record import CALIBRATION, camera_file_of, write_record
     from rstrack.calibration.run import calibrate as run_calibration
     from rstrack.data.dataset import open_dataset
-    from rstrack.data.rig import UNDISTORTED_K1
+    from rstrack.data.rig import UNDISTORTED
     from rstrack.metrics.association import truth_of
     from rstrack.metrics.run_evaluate import add_errors, error_note
     from rstrack.tracking.runs import run
@@ -102,7 +102,7 @@ def track(
         write_record(found, out / CALIBRATION)
         print(found.text())
     print("\n".join(text for text in (result.text(), errors) if text))
-    if found is None and dataset.rig.sigma.k1 >= UNDISTORTED_K1:
+    if found is None and dataset.rig.sigma.k1 >= UNDISTORTED["k1"]:
         print(
             "the camera file has no distortion, which hardly any camera is without: --calibrate finds lens, clocks and "
             "readouts first"

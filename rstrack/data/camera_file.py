@@ -176,6 +176,7 @@ class _Sigma(_Entry):
     aspect: Sigma | None = None
     center_px: Annotated[float, Field(ge=0, le=1e3, allow_inf_nan=False)] | None = None
     k1: Sigma | None = None
+    p: Sigma | None = None
     rotation_deg: Annotated[float, Field(ge=0, le=30, allow_inf_nan=False)] | None = None
     translation_m: Sigma | None = None
     readout_s: Sigma | None = None

@@ -20,7 +20,7 @@ from rsgen.limits import rigid
 from rstrack.data.depth_pattern import pattern_image
 
 _ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
-_LENS = "focal", "aspect", "cx", "cy", "k1"
+_LENS = "focal", "aspect", "cx", "cy", "k1", "p1", "p2"
 CALIBRATION_NAMES = (
     *(f"depth.{name}" for name in _LENS), *(f"color.{name}" for name in _LENS),
     *(f"T_color_depth.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")),
@@ -28,8 +28,9 @@ CALIBRATION_NAMES = (
 )  # fmt: skip
 """The parameters, in the order of vectors.
 
-Lenses: focal lengths as a part of themselves, aspect as a part of fy alone, cx and cy in focal lengths, k1 as OpenCV
-counts it. T_color_depth ← exp(ε) T_color_depth. Depth's scale as a part, its inverse offset in 1/m (`DepthError`).
+Lenses: focal lengths as a part of themselves, aspect as a part of fy alone, cx and cy in focal lengths, k1, p1 and p2
+as OpenCV counts them. T_color_depth ← exp(ε) T_color_depth. Depth's scale as a part, its inverse offset in 1/m
+(`DepthError`).
 """
 
 
@@ -38,15 +39,17 @@ class CalibrationSigma:
     """Standard deviations of what a camera file states, of both cameras alike; 0: exact.
 
     focal: part of the focal lengths; aspect: part of fy beyond that; center: principal point, in focal lengths; k1:
-    distortion; rotation_deg, translation_m: of T_color_depth, an axis; readout_s; offset_s: colour's clock;
-    depth_scale: part; depth_inverse_offset: 1/m. depth_image: 1/m, what inverse depth of each image is off by as a
-    whole, by an offset and by two tilts: no parameter, but solved for with every pose.
+    radial distortion; p: tangential distortion, p1 and p2 alike; rotation_deg, translation_m: of T_color_depth, an
+    axis; readout_s; offset_s: colour's clock; depth_scale: part; depth_inverse_offset: 1/m. depth_image: 1/m, what
+    inverse depth of each image is off by as a whole, by an offset and by two tilts: no parameter, but solved for with
+    every pose.
     """
 
     focal: float = 0.0
     aspect: float = 0.0
     center: float = 0.0
     k1: float = 0.0
+    p: float = 0.0
     rotation_deg: float = 0.0
     translation_m: float = 0.0
     readout_s: float = 0.0
@@ -56,8 +59,8 @@ class CalibrationSigma:
     depth_image: float = 0.0
 
     def vector(self, is_registered: bool = False) -> FloatArray:
-        """In the order of CALIBRATION_NAMES (21,). is_registered: both streams are seen through the colour camera."""
-        lens = np.array([self.focal, self.aspect, self.center, self.center, self.k1])
+        """In the order of CALIBRATION_NAMES (25,). is_registered: both streams are seen through the colour camera."""
+        lens = np.array([self.focal, self.aspect, self.center, self.center, self.k1, self.p, self.p])
         pose = np.array([self.translation_m, math.radians(self.rotation_deg)]).repeat(3)
         own = 0.0 if is_registered else 1.0
         times = self.readout_s, self.readout_s, self.offset_s
@@ -72,14 +75,14 @@ class CalibrationSigma:
 EXACT_SIGMA = CalibrationSigma()
 """Of renderings, but for depth cameras with fixed errors."""
 
-DEFAULT_SIGMA = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005, 0.001)
+DEFAULT_SIGMA = CalibrationSigma(0.01, 0.003, 0.01, 0.02, 0.001, 0.3, 0.005, 0.003, 0.003, 0.01, 0.005, 0.001)
 """Of a camera file that states none: a judgement of what such files have wrong, not a measurement."""
 
 UNFOUND_OFFSET_S = 0.015
 """σ of colour's clock where it is looked for and not found: half a frame at 30 Hz, as cameras run that nothing ties."""
 
-UNDISTORTED_K1 = 0.1
-"""σ of k1 where a real lens is stated to have no distortion, as it hardly ever is."""
+UNDISTORTED = {"k1": 0.1, "p": 0.003}
+"""σ where a real lens is stated to have no distortion, as it hardly ever is."""
 
 
 UNSTATED_POSE = {"translation_m": 0.025, "rotation_deg": 1.0}
@@ -96,7 +99,7 @@ def sigma_of_file(
     found = dict(stated or {})
     if "center_px" in found:
         found["center"] = found.pop("center_px") / camera.fx
-    unstated = {} if any(camera.distortion) else {"k1": UNDISTORTED_K1}
+    unstated = {} if any(camera.distortion) else UNDISTORTED
     return replace(DEFAULT_SIGMA, **(unstated | ({} if has_pose else UNSTATED_POSE) | found))
 
 

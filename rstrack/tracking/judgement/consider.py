@@ -29,8 +29,8 @@ NEAR, _POINTS = 0.05, 400
 COUNT = len(CALIBRATION_NAMES)
 # Keyframes whose landmarks are remembered.
 _REMEMBERED = 4
-_DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 5), slice(5, 10), slice(10, 16)
-_DEPTH_READOUT, _COLOR_READOUT, CLOCK, _SCALE, _INVERSE = range(16, COUNT)
+_DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 7), slice(7, 14), slice(14, 20)
+_DEPTH_READOUT, _COLOR_READOUT, CLOCK, _SCALE, _INVERSE = range(20, COUNT)
 # Part of what the points see in all directions below which a direction is not seen.
 _LEAST = 1e-6
 
@@ -84,7 +84,7 @@ def _slopes(points: Points, shape: tuple[int, int], stride: int) -> FloatArray:
 @dataclass(frozen=True, eq=False)
 class Coupling:
     """Of one image: J (n, 12), the residuals' derivatives by a twist of all lines, and by one that grows from the first
-    line, −1, to the last, 1; c (n, 22), those by the parameters, and by colour's clock in the keyframe alone."""
+    line, −1, to the last, 1; c (n, 26), those by the parameters, and by colour's clock in the keyframe alone."""
 
     J: FloatArray
     c: FloatArray
@@ -149,7 +149,7 @@ def coupling(
 
 
 class Calibration:
-    """A rig whose camera file may be wrong. rays: as a method sees it; sigmas (21,): of the parameters."""
+    """A rig whose camera file may be wrong. rays: as a method sees it; sigmas (25,): of the parameters."""
 
     def __init__(self, rays: Rays, sigmas: FloatArray) -> None:
         self._rays, self.sigmas = rays, sigmas
@@ -174,7 +174,7 @@ class Calibration:
         return not self.sigmas.any()
 
     def moved(self, o: Observation, state: SplineState, velocity: FloatArray, count: int = 6) -> FloatArray:
-        """How one σ of each parameter would have an image move its lines (count, 21), against a rectified keyframe.
+        """How one σ of each parameter would have an image move its lines (count, 25), against a rectified keyframe.
 
         velocity (6,): at which that was taken. count: 6 for all lines alike, 12 as of `Observation.steady`.
         """
@@ -210,15 +210,17 @@ class Calibration:
 def _moves(
     rays: Rays, is_depth: bool, p: FloatArray, q: FloatArray, velocity: FloatArray, line: FloatArray, lens: Lens
 ) -> FloatArray:  # fmt: skip
-    """By how much errors of the parameters move points (21, n, 3) in the depth camera's axes, if a camera sees them.
+    """By how much errors of the parameters move points (25, n, 3) in the depth camera's axes, if a camera sees them.
 
     p, q (n, 3): the points in the depth camera's frame and in that camera's; velocity (6,): of the depth camera; line
     (n,): when they are seen, see `_line`.
     """
     out = np.zeros((COUNT, *p.shape))
     x, y, z = (q / q[:, 2:]).T[0], (q / q[:, 2:]).T[1], q[:, 2]
-    r2, nothing = x * x + y * y, np.zeros_like(x)
-    by_lens = -z * np.array([[x, y], [nothing, y], [nothing + 1, nothing], [nothing, nothing + 1], [x * r2, y * r2]])
+    r2, xy, zero = x * x + y * y, 2.0 * x * y, np.zeros_like(x)
+    pinhole = [x, y], [zero, y], [zero + 1, zero], [zero, zero + 1]
+    bent = [x * r2, y * r2], [xy, r2 + 2 * y * y], [r2 + 2 * x * x, xy]
+    by_lens = -z * np.array([*pinhole, *bent])
     turned = by_lens.transpose(0, 2, 1) @ (np.eye(3) if is_depth else rays.T_color_depth[:3, :3])[:2]
     rolled = velocity[:3] + np.cross(velocity[3:], p)
     if is_depth:

@@ -17,6 +17,7 @@ from rstrack.calibration.parameters import (
     COUNT,
     DEPTH_ERROR,
     DEPTH_LENS,
+    NAMES,
     POSES,
     PRIOR,
     changed,
@@ -122,6 +123,13 @@ def test_the_camera_file_says_what_was_found(shaken: Dataset, tmp_path: Path) ->
     vague = replace(shaken, rig=replace(shaken.rig, sigma=replace(EXACT_SIGMA, rotation_deg=1.0, translation_m=0.02)))
     still = replace(made, dataset=vague).stated_sigmas()
     assert still["translation_m"] == 0.02 and still["rotation_deg"] < 0.1
+    # p1 and p2 trade with the principal point here: it holds nearly all of their σ.
+    trading = A.copy()
+    lens = [NAMES.index(f"color.{name}") - 1 for name in ("cx", "p2")]
+    trading[:, lens[0], lens[1]] = trading[:, lens[1], lens[0]] = -0.99 * np.sqrt(np.prod(A[0].diagonal()[lens]))
+    traded = replace(made, solution=replace(solution, A=trading)).stated_sigmas()
+    assert still["p"] == pytest.approx(made.sigmas[NAMES.index("color.p2")], rel=0.01)
+    assert traded["center_px"] > 5.0 * still["center_px"] and traded["p"] == still["p"]
     parameters = made.as_dict()["parameters"]
     assert parameters["T_color_depth.y"]["sigma"] is None and parameters["color.offset_s"]["sigma"] > 0.0
 

@@ -14,6 +14,7 @@ from nightly import sampled
 from shaken_recording import OPTIONS, SHORT
 from shaken_recording import told as told_wrongly
 
+from rsgen.device.lens import Lens
 from rsgen.errors import UserError
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
@@ -24,7 +25,7 @@ from rstrack.data.rig import (
     CALIBRATION_NAMES,
     DEFAULT_SIGMA,
     EXACT_SIGMA,
-    UNDISTORTED_K1,
+    UNDISTORTED,
     UNSTATED_POSE,
     CalibrationSigma,
     Frame,
@@ -33,7 +34,7 @@ from rstrack.data.rig import (
 )
 from rstrack.options import Options
 from rstrack.tracking.judgement.calibration_errors import CalibrationErrors
-from rstrack.tracking.judgement.consider import CLOCK, COUNT
+from rstrack.tracking.judgement.consider import CLOCK, COUNT, Rays, _moves
 from rstrack.tracking.runs.run import track
 from rstrack.tracking.spline_tracker import Tracker
 
@@ -42,7 +43,7 @@ SHUTTER = Shutter(readout_s=0.028)
 TRUTH = synthetic.make_spline(0.3)
 FRAMES = 12
 # Every parameter by itself: one σ is one unit, but of the clock, which is put right where it may be off by much.
-UNIT = CalibrationSigma(1.0, 1.0, 1.0, 1.0, float(np.degrees(1.0)), 1.0, 1.0, 1e-6, 1.0, 1.0)
+UNIT = CalibrationSigma(1.0, 1.0, 1.0, 1.0, 1.0, float(np.degrees(1.0)), 1.0, 1.0, 1e-6, 1.0, 1.0)
 UNITS = np.where(np.arange(COUNT) == CLOCK, UNIT.offset_s, 1.0)
 RIG = Rig(CAMERA, SHUTTER, CAMERA, SHUTTER, synthetic.T_COLOR_DEPTH)
 
@@ -68,7 +69,7 @@ def tracked(rig: Rig, method: str = "rs-pg", scale: float = 1.0, late_s: float =
 
 @cache
 def told(method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Poses of frames, and what one unit of each parameter does to them (n, 6, 21)."""
+    """Poses of frames, and what one unit of each parameter does to them (n, 6, 25)."""
     tracker = tracked(replace(RIG, sigma=UNIT), method)
     common = np.stack([report.common for report in tracker.reports[-6:]])  # type: ignore[misc]
     return tracker.trajectory[1][-6:], common / UNITS
@@ -91,6 +92,8 @@ def wrong(name: str, by: float) -> tuple[Rig, float, float]:
         "cx": replace(CAMERA, cx=CAMERA.cx + by * CAMERA.fx),
         "cy": replace(CAMERA, cy=CAMERA.cy + by * CAMERA.fx),
         "k1": replace(CAMERA, model="radtan", distortion=(by, 0.0, 0.0, 0.0)),
+        "p1": replace(CAMERA, model="radtan", distortion=(0.0, 0.0, by, 0.0)),
+        "p2": replace(CAMERA, model="radtan", distortion=(0.0, 0.0, 0.0, by)),
     }[own]  # fmt: skip
     return (replace(RIG, depth_camera=camera) if kind == "depth" else replace(RIG, color_camera=camera)), 1.0, 0.0
 
@@ -100,6 +103,7 @@ def wrong(name: str, by: float) -> tuple[Rig, float, float]:
     sampled([
         ("depth.focal", 0.01, "rs-pg", 0.5), ("depth.focal", 0.01, "rs-g", 0.5), ("depth.aspect", 0.01, "rs-g", 0.5),
         ("depth.cx", 0.01, "rs-g", 0.5), ("depth.cy", 0.01, "rs-g", 0.5), ("depth.k1", 0.05, "rs-g", 0.5),
+        ("color.p1", 0.005, "rs-p", 0.6),
         ("depth.scale", 0.01, "rs-g", 0.1), ("depth.scale", 0.01, "rs-pg", 0.1), ("depth.scale", 0.01, "rs-p", 0.1),
         ("color.focal", 0.01, "rs-p", 0.6), ("color.k1", 0.03, "rs-p", 0.6),
     ], 3),
@@ -112,6 +116,22 @@ def test_a_wrong_camera_moves_poses_as_the_model_says(name: str, by: float, meth
     expected = by * common[:, :, CALIBRATION_NAMES.index(name)]
     weight = np.repeat([1.0, 2.0], 3)  # m, rad: things are some two metres away
     assert np.linalg.norm((moved - expected) * weight) < part * np.linalg.norm(moved * weight)
+
+
+@pytest.mark.parametrize("stream", ["depth", "color"])
+@pytest.mark.parametrize("own", ["focal", "aspect", "cx", "cy", "k1", "p1", "p2"])
+def test_a_wrong_lens_moves_the_points_of_pixels_as_the_camera_has_it(stream: str, own: str) -> None:
+    """Of planar z, as depth images have it, by a difference quotient."""
+    by, uv = 1e-4, np.random.default_rng(3).uniform((5.0, 5.0), (150.0, 110.0), (50, 2))
+    rig, _, _ = wrong(f"{stream}.{own}", by)
+    z = np.linspace(0.5, 3.0, len(uv))[:, None]
+    q = z * CAMERA.unproject(uv)
+    moved = z * (getattr(rig, f"{stream}_camera").unproject(uv) - CAMERA.unproject(uv)) / by
+    T = np.eye(4) if stream == "depth" else RIG.T_color_depth
+    p, lens = se3.transform(se3.inverse(T), q), Lens(CAMERA, SHUTTER)
+    by_name = _moves(Rays(lens, lens, RIG.T_color_depth, False), stream == "depth", p, q, np.zeros(6), uv[:, 0], lens)
+    found = by_name[CALIBRATION_NAMES.index(f"{stream}.{own}")]
+    assert found == pytest.approx(moved @ T[:3, :3], abs=0.01 * float(np.abs(moved).max()))
 
 
 def test_colours_that_are_late_are_so_by_how_far_the_camera_moves_meanwhile() -> None:
@@ -148,8 +168,8 @@ def test_only_what_may_be_wrong_has_a_column() -> None:
 
 def test_registered_depth_has_one_lens_and_no_extrinsics() -> None:
     sigmas = DEFAULT_SIGMA.vector(is_registered=True)
-    assert not sigmas[:5].any() and not sigmas[10:16].any() and sigmas[5:10].all()
-    assert DEFAULT_SIGMA.vector()[:16].all() and not EXACT_SIGMA.vector().any()
+    assert not sigmas[:7].any() and not sigmas[14:20].any() and sigmas[7:14].all()
+    assert DEFAULT_SIGMA.vector()[:20].all() and not EXACT_SIGMA.vector().any()
 
 
 FILE = "color: {width: 640, height: 480, intrinsics: [500.0, 500.0, 319.5, 239.5], readout_s: 0.03%s}\n%s"
@@ -163,7 +183,7 @@ def read(tmp_path: Path, lens: str, sigma: str) -> Rig:
 def test_a_camera_file_states_what_it_knows_and_the_rest_is_as_usual(tmp_path: Path) -> None:
     bent = ", model: radtan, distortion: [0.1, 0.0, 0.0, 0.0]"
     assert read(tmp_path, bent, "").sigma == DEFAULT_SIGMA
-    assert read(tmp_path, "", "").sigma == replace(DEFAULT_SIGMA, k1=UNDISTORTED_K1)
+    assert read(tmp_path, "", "").sigma == replace(DEFAULT_SIGMA, **UNDISTORTED)
     stated = read(tmp_path, bent, "sigma: {focal: 0.002, center_px: 1.5}").sigma
     assert stated == replace(DEFAULT_SIGMA, focal=0.002, center=0.003)
 
