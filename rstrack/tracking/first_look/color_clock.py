@@ -14,16 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
-from rsgen.geometry.spline import Spline
 from rstrack.data.dataset import Dataset
+from rstrack.data.image_files import prefetched
 from rstrack.data.rig import UNFOUND_OFFSET_S
-from rstrack.tracking.first_look.rough_track import GeometricTrack, image_of, looked_up, pairs_in, pixels_of, points_of
+from rstrack.tracking.first_look.rough_track import GeometricTrack
+from rstrack.tracking.first_look.views import Views, looked_up, pairs_in, pixels_of
 
 # For the progress bar.
 _STAGE = "colour's clock"
@@ -31,6 +31,8 @@ _STAGE = "colour's clock"
 _MOST_S, _COARSE_S, _FINE_S = 0.06, 0.01, 0.0025
 # Fine offsets on each side of the best one through which a parabola is laid.
 _NEAR = 2
+# Pairs looked up in a thread meanwhile.
+_AHEAD = 4
 # The fewest points that a pair may share.
 _FEWEST = 400
 # The offset is taken for determined if its standard error is below this, and it lies inside of what was looked at.
@@ -86,12 +88,12 @@ def estimate_color_offset(
 def _estimate(dataset: Dataset, track: GeometricTrack | None, progress: Progress) -> ColorOffset:
     if track is None:
         return ColorOffset(0.0, np.inf, 0, "the geometry alone gives no track")
-    spline = track.spline
     pairs = pairs_in(dataset, track.frames, track.begin + _MOST_S, track.end - _MOST_S)
     if len(pairs) < 6:
         return ColorOffset(0.0, np.inf, len(pairs), "too few images overlap")
     coarse = np.arange(-_MOST_S, _MOST_S + 1e-9, _COARSE_S)
-    costs, noise = _costs(dataset, spline, pairs, coarse, progress)
+    views = Views(dataset, track.spline)
+    costs, noise = _costs(dataset, track, views, pairs, coarse, progress)
     if len(costs) < 6:
         return ColorOffset(0.0, np.inf, len(costs), "too few images overlap")
     if np.median(noise) > _MOST_NOISE:
@@ -100,7 +102,7 @@ def _estimate(dataset: Dataset, track: GeometricTrack | None, progress: Progress
     if best in (0, len(coarse) - 1):
         return ColorOffset(0.0, np.inf, len(costs), f"it would be beyond {1e3 * _MOST_S:.0f} ms")
     fine = coarse[best] + np.arange(-5, 6) * _FINE_S
-    return _minimum(fine, _costs(dataset, spline, pairs, fine, progress)[0])
+    return _minimum(fine, _costs(dataset, track, views, pairs, fine, progress)[0])
 
 
 def _minimum(offsets: FloatArray, costs: FloatArray) -> ColorOffset:
@@ -133,24 +135,32 @@ def _parabola(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 
 def _costs(
-    dataset: Dataset, spline: Spline, pairs: Sequence[tuple[int, int, int]], offsets: FloatArray, progress: Progress
-) -> tuple[FloatArray, FloatArray]:
+    dataset: Dataset, track: GeometricTrack, views: Views, pairs: Sequence[tuple[int, int, int]], offsets: FloatArray,
+    progress: Progress,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast."""
-    points = lru_cache(maxsize=2)(lambda k: points_of(dataset, spline, k))
-    images = lru_cache(maxsize=16)(lambda i: image_of(dataset.images.color(i)))
 
-    @lru_cache(maxsize=3)
+    last, a = (-1, -1), np.empty(0)
+
     def at_offsets(k: int, i: int) -> FloatArray:
-        return looked_up(images(i), pixels_of(dataset, spline, points(k), dataset.color_stamps[i] + offsets))
+        pixels = pixels_of(dataset, track.spline, views.points(k), dataset.color_stamps[i] + offsets)
+        return looked_up(views.image(i), pixels)
+
+    def seen(pair: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
+        """Intensities (m, n) of the same points in both images."""
+        nonlocal last, a
+        k, i, j = pair
+        if last != (k, i):
+            last, a = (k, i), at_offsets(k, i)
+        return a, at_offsets(k, j)
 
     found = [(np.empty((0, len(offsets))), np.empty(0))]
-    for n, (k, i, j) in enumerate(pairs):
-        a, b = at_offsets(k, i), at_offsets(k, j)
-        good = np.isfinite(a).all(axis=0) & np.isfinite(b).all(axis=0)
+    for n, (one, other) in enumerate(prefetched(seen, pairs, _AHEAD), 1):
+        good = np.isfinite(one).all(axis=0) & np.isfinite(other).all(axis=0)
         if np.count_nonzero(good) >= _FEWEST:
-            cost, noise = _disagreement(a[:, good], b[:, good])
+            cost, noise = _disagreement(one[:, good], other[:, good])
             found.append((cost[None], np.array([noise])))
-        progress(_STAGE, (n + 1) / len(pairs), "comparing colour images")
+        progress(_STAGE, n / len(pairs), "comparing colour images")
     return np.concatenate([costs for costs, _ in found]), np.concatenate([noise for _, noise in found])
 
 

@@ -29,7 +29,9 @@ from rsgen.geometry import se3
 from rstrack.alignment.weights import NU
 from rstrack.data.dataset import Dataset
 from rstrack.data.depth_pattern import MEAN_SQUARES, PATTERN_SIZE, pattern_basis
-from rstrack.tracking.first_look.rough_track import GeometricTrack, projected
+from rstrack.data.image_files import prefetched
+from rstrack.tracking.first_look.rough_track import GeometricTrack
+from rstrack.tracking.first_look.views import projected
 
 # For the progress bar.
 _STAGE = "depth's pattern"
@@ -123,12 +125,16 @@ def _pairs(dataset: Dataset, track: GeometricTrack, progress: Progress) -> list[
     rays = camera.unproject(camera.pixel_grid())
     surfaces: list[_Surface | None] = []
     pairs = []
-    for n, k in enumerate(track.frames[::_EVERY]):
-        progress(_STAGE, n * _EVERY / len(track.frames), "comparing images")
+
+    def surface(k: int) -> _Surface | None:
         times = shutter.line_mid_time(dataset.stamps[k], lines, camera)
         covered = track.begin <= times.min() and times.max() <= track.end
-        surfaces.append(_surface(dataset.depth(k), track.spline.pose(times)) if covered else None)
-        new = surfaces[-1]
+        return _surface(dataset.depth(k), track.spline.pose(times)) if covered else None
+
+    frames = track.frames[::_EVERY]
+    for n, new in enumerate(prefetched(surface, frames, 2)):
+        progress(_STAGE, n / len(frames), "comparing images")
+        surfaces.append(new)
         if new is None:
             continue
         for before in (surfaces[-1 - apart] for apart in _APART if apart < len(surfaces)):

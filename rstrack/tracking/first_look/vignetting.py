@@ -16,24 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from rsgen.array_types import FloatArray
 from rsgen.console.progress import Progress, no_progress
 from rstrack.data.dataset import Dataset
+from rstrack.data.image_files import prefetched
 from rstrack.images.pyramid import corner_distance2
-from rstrack.tracking.first_look.rough_track import (
-    GeometricTrack,
-    image_of,
-    looked_up,
-    pairs_in,
-    pixels_of,
-    points_of,
-    rests,
-)
+from rstrack.tracking.first_look.rough_track import GeometricTrack
+from rstrack.tracking.first_look.views import Views, looked_up, pairs_in, pixels_of, rests
 
+# Pairs whose images are decoded in a thread meanwhile.
+_AHEAD = 4
 # The fewest points that a pair of images may share, and pairs.
 _FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
 # Mean and σ of the vignetting of a lens that nothing is known of: TUM's cameras have 0.09 and 0.45.
@@ -92,21 +87,26 @@ def estimate_vignetting(
 def _compared(dataset: Dataset, track: GeometricTrack, progress: Progress) -> list[_Pair]:
     camera, spline = dataset.rig.color_camera, track.spline
     distance2 = corner_distance2(camera.width, camera.height)[::2, ::2]
-    points = lru_cache(maxsize=2)(lambda k: points_of(dataset, spline, k))
-    images = lru_cache(maxsize=16)(lambda i: image_of(dataset.images.color(i)))
-    found = []
+    views, found = Views(dataset, spline), []
     chosen = pairs_in(dataset, track.frames, track.begin, track.end)
-    for n, (k, i, j) in enumerate(chosen):
+
+    def decoded(pair: tuple[int, int, int]) -> tuple[int, int, int]:
+        k, i, j = pair
+        views.points(k), views.image(i), views.image(j)
+        return pair
+
+    for n, (k, i, j) in enumerate(prefetched(decoded, chosen, _AHEAD), 1):
         seen, at = [], []
         for m in (i, j):
-            pixels = pixels_of(dataset, spline, points(k), dataset.color_stamps[m : m + 1])
-            seen.append(looked_up(images(m), pixels)[0])
+            pixels = pixels_of(dataset, spline, views.points(k), dataset.color_stamps[m : m + 1])
+            seen.append(looked_up(views.image(m), pixels)[0])
             at.append(looked_up(distance2, pixels)[0])
         later = int(np.abs(dataset.stamps - dataset.color_stamps[j]).argmin())
-        good = np.isfinite([*seen, *at]).all(axis=0) & rests(dataset, spline, points(k), later)
+        still = rests(dataset, spline, views.points(k), later, views.depth(later))
+        good = np.isfinite([*seen, *at]).all(axis=0) & still
         if np.count_nonzero(good) >= _FEWEST_POINTS:
             found.append(_Pair((seen[0][good], seen[1][good]), (at[0][good], at[1][good])))
-        progress("colour's corners", (n + 1) / len(chosen), "comparing colour images")
+        progress("colour's corners", n / len(chosen), "comparing colour images")
     return found
 
 

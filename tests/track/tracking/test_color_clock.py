@@ -20,7 +20,7 @@ from rstrack.data.dataset import Dataset, group_colors, open_dataset
 from rstrack.data.estimate import read_estimate
 from rstrack.data.timing import Timing, stream_timing
 from rstrack.options import Options
-from rstrack.tracking.first_look import color_clock, looked_at, rough_track
+from rstrack.tracking.first_look import color_clock, looked_at, rough_track, views
 from rstrack.tracking.first_look.color_clock import ColorOffset, estimate_color_offset
 from rstrack.tracking.first_look.rough_track import GeometricTrack, GeometricTracks
 from rstrack.tracking.runs.run import track
@@ -33,7 +33,7 @@ needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the points of images as small as these, in a third of the time."""
-    monkeypatch.setattr(rough_track, "_ACROSS", 80)
+    monkeypatch.setattr(views, "_ACROSS", 80)
     monkeypatch.setattr(color_clock, "_FEWEST", 100)
 
 
@@ -90,10 +90,10 @@ def test_the_offset_is_found_along_the_true_path(shaken: Dataset, wrong_s: float
 def test_pixels_of_rising_stamps_are_those_of_each_stamp_alone(shaken: Dataset) -> None:
     truth = shaken.truth
     assert truth is not None
-    p_world = rough_track.points_of(shaken, truth, 12)
+    p_world = views.Views(shaken, truth).points(12)
     stamps = shaken.color_stamps[12] + np.linspace(-0.06, 0.06, 13)
-    together = rough_track.pixels_of(shaken, truth, p_world, stamps)
-    alone = np.concatenate([rough_track.pixels_of(shaken, truth, p_world, stamp[None]) for stamp in stamps])
+    together = views.pixels_of(shaken, truth, p_world, stamps)
+    alone = np.concatenate([views.pixels_of(shaken, truth, p_world, stamp[None]) for stamp in stamps])
     seen = (together[..., 0] > -10.0) & (alone[..., 0] > -10.0)
     assert seen.mean() > 0.5 and (seen == (alone[..., 0] > -10.0)).mean() > 0.999
     # Poses are those of the nearest line, which may be the next one: 0.056 px here.

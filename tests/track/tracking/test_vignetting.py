@@ -17,7 +17,7 @@ from rstrack.data.estimate import read_estimate
 from rstrack.images.device_frame import DeviceRig
 from rstrack.images.pyramid import corner_distance2
 from rstrack.options import Options
-from rstrack.tracking.first_look import rough_track, vignetting
+from rstrack.tracking.first_look import views, vignetting
 from rstrack.tracking.first_look.rough_track import GeometricTrack, GeometricTracks
 from rstrack.tracking.first_look.vignetting import Vignetting, estimate_vignetting
 from rstrack.tracking.runs.run import track
@@ -29,7 +29,7 @@ needs_rpy = pytest.mark.skipif(not RPY.is_dir(), reason="../shared/data/tum_fr1_
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quarter of the points of images as small as these, in a third of the time."""
-    monkeypatch.setattr(rough_track, "_ACROSS", 80)
+    monkeypatch.setattr(views, "_ACROSS", 80)
 
 
 class Darkened:
@@ -105,11 +105,12 @@ class Covered:
 def test_points_that_depth_does_not_show_where_they_were_do_not_count(shaken: Dataset) -> None:
     """Regression: beside things that move the corners were found to be 16 % brighter where they were darker."""
     assert shaken.truth is not None
-    p_world, covered = rough_track.points_of(shaken, shaken.truth, 0), replace(shaken, images=Covered(shaken))
-    still = rough_track.rests(shaken, shaken.truth, p_world, 0)
-    hidden = rough_track.rests(covered, shaken.truth, p_world, 0)
+    seen, covered = views.Views(shaken, shaken.truth), replace(shaken, images=Covered(shaken))
+    p_world = seen.points(0)
+    still = views.rests(shaken, shaken.truth, p_world, 0, seen.depth(0))
+    hidden = views.rests(covered, shaken.truth, p_world, 0, covered.depth(0))
     assert still.mean() > 0.97 and not (hidden & ~still).any() and 0.4 < hidden.mean() < 0.6
-    later = rough_track.rests(shaken, shaken.truth, p_world, 6)
+    later = views.rests(shaken, shaken.truth, p_world, 6, seen.depth(6))
     assert 0.5 < later.mean() < 1.0
 
 
