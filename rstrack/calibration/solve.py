@@ -11,7 +11,7 @@ from scipy import special
 from rsgen.array_types import BoolArray, FloatArray
 from rstrack.alignment.normal_equations import AndersonMixing, Eliminated
 from rstrack.calibration.pairs.terms import PairTerms
-from rstrack.calibration.pairs.window import RecordingWindow
+from rstrack.calibration.pairs.window import RecordingWindow, WindowSums
 from rstrack.calibration.parameters import COUNT, DEPTH, DRIFT, PRIOR, USEFUL, Known, Parameters
 
 # Steps at most on a level, and the part of the standard errors, as the windows' scatter shows them, that ends it.
@@ -141,28 +141,28 @@ def solve(
     known = known or Known.nothing(start)
     p, acceleration, finished, step = start, AndersonMixing(), True, np.zeros(COUNT)
     try:
-        for window in windows:
-            for _ in range(_ROUNDS if window.is_new else 0):
-                window.sums(terms, p, levels[0], depth_counts)
+        new = [window for window in windows if window.is_new]
+        for _ in range(_ROUNDS):
+            _sums(new, terms, p, levels[0], depth_counts)
         for level in levels:
             acceleration.reset()
             for n in range(steps):
                 watch(level, n, p)
-                sums = [window.sums(terms, p, level, depth_counts) for window in windows]
+                sums = _sums(windows, terms, p, level, depth_counts)
                 step, sigmas = _step([one.reduced for one in sums], p, start, known, free, acceleration)
                 for window, one in zip(windows, sums, strict=True):
                     window.move(one.points_step(step))
                 p = p.moved(step)
                 if (np.abs(step[free]) <= _SMALL * sigmas).all():
                     break
-        sums = [window.sums(terms, p, levels[-1], depth_counts) for window in windows]
+        sums = _sums(windows, terms, p, levels[-1], depth_counts)
         last, _ = _step([one.reduced for one in sums], p, start, known, free)
         for window, one in zip(windows, sums, strict=True):
             window.move(one.points_step(last))
         p = p.moved(last)
     except KeyboardInterrupt:
         finished = False
-    sums = [window.sums(terms, p, levels[-1], depth_counts) for window in windows]
+    sums = _sums(windows, terms, p, levels[-1], depth_counts)
     reduced = [one.reduced for one in sums]
     A, b = _of_free(reduced, free)
     depth, intensity = np.median([window.sigma for window in windows], axis=0)
@@ -173,6 +173,14 @@ def solve(
         p, free, A, b, cost, float(depth), float(intensity), step, blind, finished, known.information, pixels,
         float(np.mean([one.depth_overcounts for one in sums])),
     )  # fmt: skip
+
+
+def _sums(
+    windows: Sequence[RecordingWindow], terms: PairTerms, p: Parameters, level: int, depth_counts: float
+) -> list[WindowSums]:  # fmt: skip
+    """Of each window; the device works on one while another's are added up."""
+    launched = [window.launched(terms, p, level, depth_counts) for window in windows]
+    return [sums() for sums in launched]
 
 
 def joined(first: Solution, then: Solution) -> Solution:

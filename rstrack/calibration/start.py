@@ -26,6 +26,7 @@ from rstrack.calibration.pairs.terms import PairTerms
 from rstrack.calibration.pairs.window import RecordingWindow, WindowFrame
 from rstrack.calibration.parameters import Parameters
 from rstrack.data.dataset import Dataset
+from rstrack.data.image_files import prefetched
 from rstrack.data.rig import DepthError
 from rstrack.images.pyramid import in_range, intensity, pyramid
 from rstrack.options import Method, Options
@@ -115,16 +116,22 @@ def load_window(
 
     Raises UserError: an image that cannot be read.
     """
+
+    def decoded(k: int) -> tuple[Float32Image, list[Float32Image]] | None:
+        """Intensities and their levels; None where there is no image."""
+        if not dataset.groups[k]:
+            return None
+        color = dataset.images.color(dataset.groups[k][0])
+        grey = intensity(color)
+        return grey, in_range(pyramid(grey), color)
+
     surfaces, bounds = [], []
     colors: list[list[Float32Image]] = []
-    for k in frames:
+    for k, seen in zip(frames, prefetched(decoded, frames, 2), strict=True):
         surfaces.append(_surface(dataset, k, options.max_depth))
-        colors.append([])
-        if dataset.groups[k]:
-            color = dataset.images.color(dataset.groups[k][0])
-            grey = intensity(color)
-            colors[-1] = in_range(pyramid(grey), color)
-            bounds.append(intensity_bound(grey, dataset.rig.color_camera.fx, surfaces[-1].median_depth))
+        colors.append([] if seen is None else seen[1])
+        if seen is not None:
+            bounds.append(intensity_bound(seen[0], dataset.rig.color_camera.fx, surfaces[-1].median_depth))
     images = window_images(terms.e, surfaces, colors, max(bounds), terms.stride)
     views = [_view(terms, dataset, k) for k in frames]
     begin, end = span([taken for view in views for taken in (view.depth, view.color)], p)

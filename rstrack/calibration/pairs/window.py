@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -90,7 +90,12 @@ class RecordingWindow:
 
         depth_counts: part of depth's pixels that count, as the others only repeat them.
         """
-        size = 6 * len(self.spline.control_points) + COUNT
+        return self.launched(terms, p, level, depth_counts)()
+
+    def launched(
+        self, terms: PairTerms, p: Parameters, level: int, depth_counts: float = 1.0
+    ) -> Callable[[], WindowSums]:  # fmt: skip
+        """The same, once it is called; the device works on it meanwhile. The spline must stay as it is until then."""
         base, lever = self.base(p)
         optics, pairs = terms.optics(p), partners(len(self.views), _APART[::2] if self.is_rough else _APART)
         depths = lines_of([view.depth for view in self.views], self.spline, p, base)
@@ -102,6 +107,14 @@ class RecordingWindow:
         if len(seen):
             given = self.images, level, seen, lines, optics, self.brightness
             started.append(terms.by_color(*given, self.sigma[1], lever))
+        return lambda: self._added(started, lines, seen, terms, p, depth_counts)
+
+    def _added(
+        self, started: Sequence[Callable[[], PairSums]], lines: tuple[LinePoses, LinePoses], seen: IntArray,
+        terms: PairTerms, p: Parameters, depth_counts: float,
+    ) -> WindowSums:  # fmt: skip
+        """What `started` has summed, of depth and of the pairs `seen` (n, 2) of colour, in one system."""
+        size = 6 * len(self.spline.control_points) + COUNT
         H, g, cost, found = np.zeros((size, size)), np.zeros(size), 0.0, list(self.sigma)
         sums = [sums_of() for sums_of in started]
         for kind, one in enumerate(sums):
