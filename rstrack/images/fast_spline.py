@@ -195,7 +195,8 @@ def _rows(
         v, w = (own[0], own[1], own[2]), (own[3], own[4], own[5])
         # Central differences; a node's twist and the next one's are as far apart as their times.
         before, after = max(n - 1, 0), min(n + 1, nodes - 1)
-        per_s = 1.0 / (middle[after] - middle[before]) if after > before else 0.0
+        apart = middle[after] - middle[before]
+        per_s = 1.0 / apart if apart != 0.0 else 0.0
         change = (twist[after] - twist[before]) * per_s
         dv, dw = (change[0], change[1], change[2]), (change[3], change[4], change[5])
         if is_inverse:

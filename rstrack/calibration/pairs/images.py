@@ -4,7 +4,7 @@ poses."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +18,10 @@ from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
-from rsgen.geometry.so3 import hat
 from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
 from rstrack.calibration.parameters import DRIFT, EXTRINSICS, Parameters
-from rstrack.images.line_poses import rows_of
+from rstrack.images.fast_spline import motions, rows
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import depth_scaling
 from rstrack.keyframes.surface import surface_bends, surface_slopes
@@ -91,18 +90,17 @@ def lines_of(images: Sequence[ImageTiming], spline: Spline, p: Parameters, T_bas
     begin = np.array([taken.begin(p) for taken in images])
     T_cam_body = np.eye(4) if is_depth else p.T_color_depth
 
-    def motion(lines: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times (images, n), poses T_base_body and the bodies' twists a second at lines (n,)."""
+    def times(lines: FloatArray) -> FloatArray:
+        """Of lines (n,): (images, n)."""
         # Times that a step too far has led out of the spline are brought back: the next one leads back.
-        t = np.clip(begin[:, :1] + begin[:, 1:] * (lines / lens.lines), spline.t_begin, spline.t_end)
-        T_world_body, velocity = spline.pose_and_velocity(t)
-        return t, T_base_world @ T_world_body, velocity
+        return np.clip(begin[:, :1] + begin[:, 1:] * (lines / lens.lines), spline.t_begin, spline.t_end)
 
     blocks, _, per, _ = block_counts(lens, lens)
     middle = _middles(blocks, per, lens.lines)
-    t, T_base_body, velocity = motion(middle)
-    Ad = se3.adjoint(T_base_body)
-    by_time = (Ad @ velocity[..., None])[..., 0]
+    t = times(middle)
+    T_world_body, velocity = motions(spline, t.ravel())
+    Ad = se3.adjoint(T_base_world @ T_world_body.reshape(*t.shape, 4, 4))
+    by_time = (Ad @ velocity.reshape(*t.shape, 6, 1))[..., 0]
     by_readout = by_time * (middle / lens.lines)[:, None]
     columns, moved = [by_readout[..., None]], (0,)
     if not is_depth:
@@ -113,49 +111,22 @@ def lines_of(images: Sequence[ImageTiming], spline: Spline, p: Parameters, T_bas
         moved = (1, 2, DRIFT, *range(EXTRINSICS.start, EXTRINSICS.stop))
     first, J = spline.pose_jacobian(t)
     by_points = np.moveaxis(se3.adjoint(T_base_world) @ J, 2, 3).reshape(*first.shape, 6, 24)
-    tables = _tables(motion, begin[0, 1], lens.lines, T_cam_body)
-    return LinePoses(*tables, first, np.concatenate([by_points, *columns], axis=-1), moved)
+    slopes = np.concatenate([by_points, *columns], axis=-1)
+    # Poses of the lines from those of every few of them.
+    per = max(1, lens.lines // _NODES)
+    nodes, delay = _middles(-(-lens.lines // per), per, lens.lines), begin[0, 1] / lens.lines
+    after = delay * (np.arange(len(nodes) * per) - nodes.repeat(per)).reshape(len(nodes), per)
+    to_base, from_base = (np.empty((len(images), lens.lines, n), np.float32) for n in (12, 18))
+    for k, at in enumerate(times(nodes)):
+        to_base[k] = rows(spline, at, after, lens.lines, T_base_world, se3.inverse(T_cam_body), False)
+        from_base[k] = rows(spline, at, after, lens.lines, T_cam_body, se3.inverse(T_base_world), True, delay)
+    return LinePoses(to_base, from_base, first, slopes, moved)
 
 
 def _middles(blocks: int, per: int, lines: int) -> FloatArray:
     """The middle (blocks,) of each block of `per` lines, of which the last may have fewer."""
     first = np.arange(blocks) * per
     return np.asarray(0.5 * (first + np.minimum(first + per, lines) - 1))
-
-
-def _tables(
-    motion: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]], readout_s: float, lines: int,
-    T_cam_body: FloatArray,
-) -> tuple[Float32Image, Float32Image]:  # fmt: skip
-    """to_base and from_base of `LinePoses`, by the motion at every few lines, as `line_poses` has it for one image.
-
-    A line d from such a one is at T exp(u d + ½ u̇ d²), to second order in d, with the twist u a line.
-    """
-    per = max(1, lines // _NODES)
-    count = -(-lines // per)
-    middle = _middles(count, per, lines)
-    _, T, velocity = motion(middle)
-    u = velocity * (readout_s / lines)
-    du = np.gradient(u, middle, axis=1) if count > 1 else np.zeros_like(u)
-    d = (np.arange(count * per) - middle.repeat(per)).reshape(count, per, 1).astype(np.float32)
-    W, dW = _algebra(u), _algebra(du)
-    square, one = W @ W, np.broadcast_to(np.eye(4), W.shape)
-    there = T @ np.stack([one, W, 0.5 * (square + dW)]) @ se3.inverse(T_cam_body)
-    back = T_cam_body @ np.stack([one, -W, 0.5 * (square - dW)]) @ se3.inverse(T)
-    twist = np.stack([u, du, np.zeros_like(u)]) @ se3.adjoint(T_cam_body).T
-
-    def at_lines(powers: FloatArray) -> Float32Image:
-        a, b, c = powers[:, :, :, None].astype(np.float32)
-        return (a + d * (b + d * c)).reshape(len(T), -1, powers.shape[-1])[:, :lines]
-
-    return at_lines(rows_of(there)), at_lines(np.concatenate([rows_of(back), twist], axis=-1))
-
-
-def _algebra(twist: FloatArray) -> FloatArray:
-    """Twists (..., 6) as elements of se(3) (..., 4, 4)."""
-    out = np.zeros((*twist.shape[:-1], 4, 4))
-    out[..., :3, :3], out[..., :3, 3] = hat(twist[..., 3:]), twist[..., :3]
-    return out
 
 
 def span(images: Sequence[ImageTiming], p: Parameters) -> tuple[float, float]:

@@ -91,7 +91,7 @@ def test_lines_move_with_every_parameter_and_control_point_as_finite_differences
             np.testing.assert_allclose(analytic, slope(ends, 1e-6), atol=1e-7)
 
 
-@pytest.mark.parametrize("readout_s", [0.03, -0.02])
+@pytest.mark.parametrize("readout_s", [0.03, -0.02, 0.0])
 def test_lines_between_those_that_are_worked_out_lie_where_the_spline_has_them(readout_s: float) -> None:
     camera = synthetic.make_config(width=64, height=250).color.camera
     taken = ImageTiming(Lens(camera, Shutter(1.0, 0.0)), 0.4, 0.0, False)
