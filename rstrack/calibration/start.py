@@ -127,7 +127,7 @@ def load_window(
 
     surfaces, bounds = [], []
     colors: list[list[Float32Image]] = []
-    for k, seen in zip(frames, prefetched(decoded, frames, 2), strict=True):
+    for k, seen in zip(frames, prefetched(decoded, frames), strict=True):
         surfaces.append(_surface(dataset, k, options.max_depth))
         colors.append([] if seen is None else seen[1])
         if seen is not None:

@@ -233,7 +233,7 @@ Key = TypeVar("Key")
 Value = TypeVar("Value")
 
 
-def prefetched(load: Callable[[Key], Value], keys: Iterable[Key], ahead: int) -> Iterator[Value]:
+def prefetched(load: Callable[[Key], Value], keys: Iterable[Key], ahead: int = 2) -> Iterator[Value]:
     """load(key) of each key, in order; up to `ahead` (at least 1) are loaded in a thread while the last one is used.
 
     What `load` raises is raised here, in its turn. The thread has ended once the iterator is exhausted, closed or

@@ -20,9 +20,9 @@ from rsgen.limits import rigid
 from rstrack.data.depth_pattern import pattern_image
 
 _ROTATION_TOLERANCE = 1e-3  # what printing a matrix to three or four digits loses
-_LENS = "focal", "aspect", "cx", "cy", "k1", "p1", "p2"
+LENS = "focal", "aspect", "cx", "cy", "k1", "p1", "p2"
 CALIBRATION_NAMES = (
-    *(f"depth.{name}" for name in _LENS), *(f"color.{name}" for name in _LENS),
+    *(f"depth.{name}" for name in LENS), *(f"color.{name}" for name in LENS),
     *(f"T_color_depth.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")),
     "depth.readout_s", "color.readout_s", "color.offset_s", "depth.scale", "depth.inverse_offset",
 )  # fmt: skip

@@ -15,8 +15,8 @@ from rsgen.geometry import se3
 from rsgen.geometry.spline import Spline
 from rstrack.images.fast_spline import rows
 
-# Evaluations of the spline that the poses of an image's lines are taken from: about every half of a millisecond.
-_NODES = 60
+NODES = 60
+"""Evaluations of the spline that the poses of an image's lines are taken from: about every half of a millisecond."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def _line_blocks(lens: Lens) -> tuple[FloatArray, FloatArray]:
     The last block's lines that the image does not have have its middle.
     """
     at_zero = Exposure(lens, 0.0, np.eye(4))
-    per_node = max(1, lens.lines // _NODES)
+    per_node = max(1, lens.lines // NODES)
     middle = at_zero.block_times(per_node)
     dt = np.zeros(len(middle) * per_node)
     dt[: lens.lines] = at_zero.times() - middle.repeat(per_node)[: lens.lines]

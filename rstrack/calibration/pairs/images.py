@@ -22,6 +22,7 @@ from rsgen.geometry.spline import Spline
 from rstrack.alignment.block_sums import block_counts
 from rstrack.calibration.parameters import DRIFT, EXTRINSICS, Parameters
 from rstrack.images.fast_spline import motions, rows
+from rstrack.images.line_poses import NODES
 from rstrack.images.sampling import EDGE
 from rstrack.keyframes.keyframe import depth_scaling
 from rstrack.keyframes.surface import surface_bends, surface_slopes
@@ -30,8 +31,6 @@ from rstrack.keyframes.surface import surface_bends, surface_slopes
 _WINDOW = 1.0 / 160.0
 # Inverse depth larger by this part may hide a point from the colour camera.
 _HIDES = 0.2
-# Lines between which poses are interpolated: about every half of a millisecond.
-_NODES = 60
 ACROSS = 6
 """Images in a row of an atlas, which has as many rows at most: float32 places pixels to 2e-4 px still."""
 Float32Image = npt.NDArray[np.float32]
@@ -83,8 +82,8 @@ def lines_of(images: Sequence[ImageTiming], spline: Spline, p: Parameters, T_bas
     """Where the lines of images were, which one camera took, and what that depends on.
 
     A line's time is begin + readout l / lines: a later one moves its pose by its velocity. Extrinsics move the colour
-    camera against the body, which is the depth camera: by −Ad(T_world_color) ε. All images at once: calls of the
-    spline cost more than numbers do.
+    camera against the body, which is the depth camera: by −Ad(T_world_color) ε. Derivatives of all images
+    are worked out at once: calls of NumPy cost more than numbers do.
     """
     lens, is_depth = images[0].lens, images[0].is_depth
     begin = np.array([taken.begin(p) for taken in images])
@@ -113,7 +112,7 @@ def lines_of(images: Sequence[ImageTiming], spline: Spline, p: Parameters, T_bas
     by_points = np.moveaxis(se3.adjoint(T_base_world) @ J, 2, 3).reshape(*first.shape, 6, 24)
     slopes = np.concatenate([by_points, *columns], axis=-1)
     # Poses of the lines from those of every few of them.
-    per = max(1, lens.lines // _NODES)
+    per = max(1, lens.lines // NODES)
     nodes, delay = _middles(-(-lens.lines // per), per, lens.lines), begin[0, 1] / lens.lines
     after = delay * (np.arange(len(nodes) * per) - nodes.repeat(per)).reshape(len(nodes), per)
     to_base, from_base = (np.empty((len(images), lens.lines, n), np.float32) for n in (12, 18))

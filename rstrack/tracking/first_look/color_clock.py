@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -31,8 +32,6 @@ _STAGE = "colour's clock"
 _MOST_S, _COARSE_S, _FINE_S = 0.06, 0.01, 0.0025
 # Fine offsets on each side of the best one through which a parabola is laid.
 _NEAR = 2
-# Pairs looked up in a thread meanwhile.
-_AHEAD = 4
 # The fewest points that a pair may share.
 _FEWEST = 400
 # The offset is taken for determined if its standard error is below this, and it lies inside of what was looked at.
@@ -140,22 +139,18 @@ def _costs(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Costs (k, m) of the offsets (m,) of the k pairs that share enough, and their noise (k,) over the contrast."""
 
-    last, a = (-1, -1), np.empty(0)
-
+    @lru_cache(maxsize=3)
     def at_offsets(k: int, i: int) -> FloatArray:
         pixels = pixels_of(dataset, track.spline, views.points(k), dataset.color_stamps[i] + offsets)
         return looked_up(views.image(i), pixels)
 
     def seen(pair: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
         """Intensities (m, n) of the same points in both images."""
-        nonlocal last, a
         k, i, j = pair
-        if last != (k, i):
-            last, a = (k, i), at_offsets(k, i)
-        return a, at_offsets(k, j)
+        return at_offsets(k, i), at_offsets(k, j)
 
     found = [(np.empty((0, len(offsets))), np.empty(0))]
-    for n, (one, other) in enumerate(prefetched(seen, pairs, _AHEAD), 1):
+    for n, (one, other) in enumerate(prefetched(seen, pairs), 1):
         good = np.isfinite(one).all(axis=0) & np.isfinite(other).all(axis=0)
         if np.count_nonzero(good) >= _FEWEST:
             cost, noise = _disagreement(one[:, good], other[:, good])

@@ -132,7 +132,7 @@ def _pairs(dataset: Dataset, track: GeometricTrack, progress: Progress) -> list[
         return _surface(dataset.depth(k), track.spline.pose(times)) if covered else None
 
     frames = track.frames[::_EVERY]
-    for n, new in enumerate(prefetched(surface, frames, 2)):
+    for n, new in enumerate(prefetched(surface, frames)):
         progress(_STAGE, n / len(frames), "comparing images")
         surfaces.append(new)
         if new is None:

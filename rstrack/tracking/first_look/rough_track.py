@@ -45,7 +45,7 @@ def rough_track(dataset: Dataset, frames: range, options: Options, done: Callabl
         return Frame(Image(frame.depth.stamp, z), frame.colors)
 
     with suppress(UserError, np.linalg.LinAlgError):
-        for count, frame in enumerate(prefetched(thinned, frames, 2), 1):
+        for count, frame in enumerate(prefetched(thinned, frames), 1):
             tracker.feed(frame)
             done(count / len(frames))
     return tracker

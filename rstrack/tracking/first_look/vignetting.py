@@ -27,8 +27,6 @@ from rstrack.images.pyramid import corner_distance2
 from rstrack.tracking.first_look.rough_track import GeometricTrack
 from rstrack.tracking.first_look.views import Views, looked_up, pairs_in, pixels_of, rests
 
-# Pairs whose images are decoded in a thread meanwhile.
-_AHEAD = 4
 # The fewest points that a pair of images may share, and pairs.
 _FEWEST_POINTS, _FEWEST_PAIRS = 400, 6
 # Mean and σ of the vignetting of a lens that nothing is known of: TUM's cameras have 0.09 and 0.45.
@@ -95,7 +93,7 @@ def _compared(dataset: Dataset, track: GeometricTrack, progress: Progress) -> li
         views.points(k), views.image(i), views.image(j)
         return pair
 
-    for n, (k, i, j) in enumerate(prefetched(decoded, chosen, _AHEAD), 1):
+    for n, (k, i, j) in enumerate(prefetched(decoded, chosen), 1):
         seen, at = [], []
         for m in (i, j):
             pixels = pixels_of(dataset, spline, views.points(k), dataset.color_stamps[m : m + 1])

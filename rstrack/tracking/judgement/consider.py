@@ -19,7 +19,7 @@ from rsgen.device.lens import Lens
 from rsgen.geometry import se3
 from rstrack.alignment.observation import Observation
 from rstrack.alignment.spline_state import SplineState
-from rstrack.data.rig import CALIBRATION_NAMES, Rig
+from rstrack.data.rig import CALIBRATION_NAMES, LENS, Rig
 from rstrack.images.fast_spline import motion
 from rstrack.images.sampling import NEAREST
 from rstrack.keyframes.keyframe import Points, Reference, strides
@@ -29,8 +29,8 @@ NEAR, _POINTS = 0.05, 400
 COUNT = len(CALIBRATION_NAMES)
 # Keyframes whose landmarks are remembered.
 _REMEMBERED = 4
-_DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = slice(0, 7), slice(7, 14), slice(14, 20)
-_DEPTH_READOUT, _COLOR_READOUT, CLOCK, _SCALE, _INVERSE = range(20, COUNT)
+_DEPTH_LENS, _COLOR_LENS, _EXTRINSICS = np.split(np.arange(COUNT - 5), (len(LENS), 2 * len(LENS)))
+_DEPTH_READOUT, _COLOR_READOUT, CLOCK, _SCALE, _INVERSE = range(COUNT - 5, COUNT)
 # Part of what the points see in all directions below which a direction is not seen.
 _LEAST = 1e-6
 
@@ -232,8 +232,8 @@ def _moves(
     out[_COLOR_LENS] = turned
     for axis in range(3):
         unit = np.eye(3)[axis]
-        out[_EXTRINSICS.start + axis] = -unit @ R
-        out[_EXTRINSICS.start + 3 + axis] = -np.cross(unit, q) @ R
+        out[_EXTRINSICS[axis]] = -unit @ R
+        out[_EXTRINSICS[3 + axis]] = -np.cross(unit, q) @ R
     out[_COLOR_READOUT] = rolled * line[:, None] if lens.lines > 1 else 0.0
     out[CLOCK] = rolled
     return out

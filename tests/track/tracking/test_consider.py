@@ -131,7 +131,7 @@ def test_a_wrong_lens_moves_the_points_of_pixels_as_the_camera_has_it(stream: st
     p, lens = se3.transform(se3.inverse(T), q), Lens(CAMERA, SHUTTER)
     by_name = _moves(Rays(lens, lens, RIG.T_color_depth, False), stream == "depth", p, q, np.zeros(6), uv[:, 0], lens)
     found = by_name[CALIBRATION_NAMES.index(f"{stream}.{own}")]
-    assert found == pytest.approx(moved @ T[:3, :3], abs=0.01 * float(np.abs(moved).max()))
+    assert found == pytest.approx(moved @ T[:3, :3], abs=1e-3 * float(np.abs(moved).max()))
 
 
 def test_colours_that_are_late_are_so_by_how_far_the_camera_moves_meanwhile() -> None:
