@@ -116,7 +116,7 @@ def geometric_pixels(z: np.ndarray, image: DepthImage, ref: Reference, spline: S
 @pytest.fixture(autouse=True)
 def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line's pose from the spline: with these small images a block of eight would take 5 ms."""
-    monkeypatch.setattr(lines, "_NODES", 10**6)
+    monkeypatch.setattr(lines, "NODES", 10**6)
 
 
 @pytest.fixture(scope="module")

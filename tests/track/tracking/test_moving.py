@@ -45,7 +45,7 @@ SHAPE = 72, 96
 @pytest.fixture
 def exact_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every line's pose from the spline, not from its block's middle."""
-    monkeypatch.setattr(lines, "_NODES", 10**6)
+    monkeypatch.setattr(lines, "NODES", 10**6)
 
 
 @pytest.mark.parametrize("ref_scan", [None, "top-bottom"])
