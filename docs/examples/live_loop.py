@@ -1,10 +1,11 @@
-"""Does a tracker keep up with a camera? A recording's frames by the wall clock; what comes while it is busy is dropped.
+"""Does a tracker keep up with a camera? A recording's frames by the wall clock; what comes while it is busy waits.
 
-    python docs/examples/live_loop.py out/lr_kt2 --method rs-pg --seconds 60 --hz 30
+    python docs/examples/live_loop.py out/lr_kt2 --method rs-g --hz 30
 
-As with a camera, one frame waits at most, and a newer one takes its place. Frames are decoded before the clock starts,
-and kernels compiled. A recording that is shorter than that is played forth and back; on the way back the lines of a
-rolling shutter run backwards in time as well, so that poses are worse there, and some frames are lost.
+A start takes longer than the camera's period, and most frames take less: those that arrive meanwhile wait, and the
+tracker catches up. Beyond --queue waiting frames every second one is skipped, beyond twice that two of three: the
+camera moves less between those that are left than if only the newest were kept (--queue 1). Frames are decoded before
+the clock starts, and kernels compiled.
 
 Without --budget-ms the clock decides which frames survive, and nothing else: the survivors fed again without a clock
 give the same bits (--check).
@@ -14,13 +15,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
-from rsgen.geometry.shutter import Shutter
-from rstrack import Frame, Image, Options, Rig
+from rstrack import Frame, Options
 from rstrack.data.dataset import open_dataset
 from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 
@@ -28,48 +29,34 @@ from rstrack.tracking.any_tracker import AnyTracker, make_tracker
 WARM_UP = 20
 
 
-def played(frames: Sequence[Frame], rig: Rig, n: int) -> Frame:
-    """The n-th frame of a recording that is played forth and back: on the way back an image begins where it ended."""
-    way, k = divmod(n, len(frames) - 1)
-    begin, end = (frame.depth.stamp for frame in (frames[0], frames[-1]))
-    if way % 2 == 0:
-        later = way * (end - begin)
-        depth, *colors = (Image(i.stamp + later, i.pixels) for i in (frames[k].depth, *frames[k].colors))
-        return Frame(depth, tuple(colors))
-    mirror = 2 * end + rig.depth_shutter.readout_s + (way - 1) * (end - begin)
-    back = frames[-1 - k]
-
-    def mirrored(image: Image, shutter: Shutter) -> Image:
-        return Image(mirror - shutter.readout_s - image.stamp, image.pixels)
-
-    colors = [mirrored(image, rig.color_shutter) for image in reversed(back.colors)]
-    return Frame(mirrored(back.depth, rig.depth_shutter), tuple(colors))
-
-
 def survivors(
-    count: int, hz: float, clock: Callable[[], float], sleep: Callable[[float], None]
-) -> Iterator[tuple[int, float]]:
-    """Numbers of the frames that are not dropped, and when each arrived, s: always the newest, waited for if need be.
+    count: int, hz: float, clock: Callable[[], float], sleep: Callable[[float], None], queue: int = 1
+) -> Iterator[tuple[int, float]]:  # fmt: skip
+    """Numbers of the frames that are not dropped, and when each arrived, s: in order, waited for if need be.
 
-    clock, sleep: as of `time`, in s. Between two numbers the caller works, and frames go on arriving.
+    clock, sleep: as of `time`, in s. Between two numbers the caller works, and frames go on arriving. Of every `queue`
+    frames that wait beyond the first one more is skipped, so that the camera never moves far between two.
     """
-    begin, last = clock(), -1
-    while last < count - 1:
-        newest = min(int((clock() - begin) * hz), count - 1)
-        if newest <= last:
-            newest = last + 1
-            sleep(max(begin + newest / hz - clock(), 0.0))
-        last = newest
-        yield newest, begin + newest / hz
+    begin, arrived, waiting = clock(), 0, deque[int]()
+    while arrived < count or waiting:
+        if not waiting:
+            sleep(max(begin + arrived / hz - clock(), 0.0))
+        newest = min(max(int((clock() - begin) * hz), arrived - bool(waiting)) + 1, count)
+        waiting += range(arrived, newest)
+        arrived = newest
+        for _ in range((len(waiting) - 1) // queue):
+            waiting.popleft()
+        n = waiting.popleft()
+        yield n, begin + n / hz
 
 
 def live(
     tracker: AnyTracker, camera: Callable[[int], Frame], count: int, hz: float,
-    clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep,
+    clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep, queue: int = 1,
 ) -> tuple[list[int], np.ndarray]:  # fmt: skip
     """Numbers (n,) of the frames that were tracked, and the seconds (n,) from each one's arrival to its pose."""
     fed, latencies = [], []
-    for n, arrived in survivors(count, hz, clock, sleep):
+    for n, arrived in survivors(count, hz, clock, sleep, queue):
         tracker.feed(camera(n))
         fed.append(n)
         latencies.append(clock() - arrived)
@@ -87,42 +74,39 @@ def main(
     )
     parser.add_argument("--camera", type=Path, help="camera file, as of rstrack track")
     parser.add_argument("--method", default="rs-pg", help="one without an IMU")
-    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seconds", type=float, default=np.inf, help="by the clock (default: the whole recording)")
     parser.add_argument("--hz", type=float, default=30.0, help="frames a second that the clock says have arrived")
+    parser.add_argument("--queue", type=int, default=30, help="frames that may wait before some are skipped")
     parser.add_argument(
         "--budget-ms", type=float, help="of a frame, as of rstrack track; poses depend on the clock then"
     )
     parser.add_argument("--check", action="store_true", help="feed the survivors again without a clock: the same bits?")
     given = parser.parse_args(words)
 
-    dataset, count = open_dataset(given.recording, given.camera), round(given.seconds * given.hz)
-    frames, rig = list(dataset.frames(0, max(count, 2))), dataset.rig
-    interval_s = dataset.interval_s(range(len(frames)))
+    dataset = open_dataset(given.recording, given.camera)
+    count = int(min(len(dataset.stamps), given.seconds * given.hz))
+    frames, interval_s = list(dataset.frames(0, count)), dataset.interval_s(range(count))
 
     def new() -> AnyTracker:
-        return make_tracker(rig, Options(method=given.method, budget_ms=given.budget_ms), interval_s=interval_s)
-
-    def camera(n: int) -> Frame:
-        return played(frames, rig, n)
+        return make_tracker(dataset.rig, Options(method=given.method, budget_ms=given.budget_ms), interval_s=interval_s)
 
     warm = new()
-    for n in range(min(WARM_UP, count)):
-        warm.feed(camera(n))
+    for frame in frames[:WARM_UP]:
+        warm.feed(frame)
     tracker = new()
-    fed, seconds = live(tracker, camera, count, given.hz, clock, sleep)
+    fed, seconds = live(tracker, frames.__getitem__, count, given.hz, clock, sleep, given.queue)
     lost, cut = (sum(getattr(report, name) for report in tracker.reports) for name in ("lost", "is_cut"))
     told = f"{len(fed)} fed, {count - len(fed)} dropped, {lost} lost, {cut} cut short"
-    print(f"{count} frames in {given.seconds:g} s: {told}")
-    median, p95, p99 = 1e3 * np.percentile(seconds, [50, 95, 99])
-    worst = int(seconds.argmax())
-    print(
-        f"latency, ms: median {median:.1f}, 95 % {p95:.1f}, 99 % {p99:.1f}, worst {1e3 * seconds[worst]:.1f} "
-        f"(frame {fed[worst]})"
-    )
+    print(f"{count} frames in {count / given.hz:.1f} s: {told}")
+    for name, after in (("all", 0.0), ("from 3 s on", 3.0)):
+        late = 1e3 * seconds[np.array(fed) >= after * given.hz]
+        if len(late):
+            median, p95, p99 = np.percentile(late, [50, 95, 99])
+            print(f"latency of {name}, ms: median {median:.1f}, 95 % {p95:.1f}, 99 % {p99:.1f}, worst {late.max():.1f}")
     if given.check:
         again = new()
         for n in fed:
-            again.feed(camera(n))
+            again.feed(frames[n])
         same = np.array_equal(tracker.trajectory[1], again.trajectory[1])
         print("fed again without a clock: " + ("the same bits" if same else "OTHER POSES"))
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from queue import Queue
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,9 @@ import pyrealsense2 as rs
 
 from rsgen import Camera, Shutter
 from rstrack import Frame, Image, Options, Rig, Tracker
+
+# Frames that may wait before every second one is skipped: a start takes a second or two.
+QUEUE = 30
 
 
 def open_pipeline(file: str | None) -> Any:
@@ -80,6 +85,24 @@ def grab(pipeline: Any, color_offset_s: float) -> Iterator[Frame]:
         yield Frame(Image(stamps[0], z), colors=(Image(stamps[1], rgb),))
 
 
+def meanwhile(frames: Iterator[Frame]) -> Iterator[Frame]:
+    """The same frames, taken from the camera by a thread while the tracker works (docs/examples/live_loop.py)."""
+    waiting: Queue[Frame | None] = Queue()
+
+    def take() -> None:
+        try:
+            for frame in frames:
+                waiting.put(frame)
+        finally:
+            waiting.put(None)
+
+    Thread(target=take, daemon=True).start()
+    while (frame := waiting.get()) is not None:
+        yield frame
+        for _ in range(waiting.qsize() // QUEUE):
+            waiting.get()
+
+
 def main(words: list[str] | None = None) -> Tracker:
     """Track until the file ends or Ctrl-C; returns the tracker, whose `spline` is the path at any time."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -91,7 +114,8 @@ def main(words: list[str] | None = None) -> Tracker:
     pipeline = open_pipeline(given.file)
     tracker = Tracker(rig_of(pipeline, given.color_readout_s), Options(method="rs-pg"))
     try:
-        for frame in grab(pipeline, given.color_offset_s):
+        frames = grab(pipeline, given.color_offset_s)
+        for frame in frames if given.file else meanwhile(frames):
             report = tracker.feed(frame)
             if report.lost:
                 print(f"{frame.depth.stamp:.3f} lost: {report.fault}")
