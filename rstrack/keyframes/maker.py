@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -35,10 +36,22 @@ from rstrack.keyframes.rectification import (
 )
 from rstrack.keyframes.surface import FloatImage, surface_roughness, surface_slopes
 
+Making = Generator[None, None, Reference]
+"""A keyframe in six parts: the device works on what one has begun until the next one."""
+
 # Metres at one metre: depths that differ by more show different surfaces.
 _AGREE = 0.03
 # Weight of a fused pixel in measurements; more would let a keyframe's first errors live for ever.
 _MOST = 30.0
+
+
+def at_once(making: Making) -> Reference:
+    """The keyframe, all parts one after the other."""
+    while True:
+        try:
+            next(making)
+        except StopIteration as made:
+            return made.value
 
 
 @dataclass
@@ -63,49 +76,62 @@ class KeyframeMaker:
 
     def rolling(self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline) -> Reference:
         """A reference that keeps its rolling shutter, for the time until it can be rectified."""
-        with self.timer("keyframes: make"):
-            lens, t = depth.exposure.lens, depth.exposure.mid_time
-            rho = self.e.download(depth.inverse_z, (lens.camera.height, lens.camera.width))
-            return self._finish(index, depth, colors, spline, t, spline.pose(t), lens, depth.inverse_z, rho, None)
+        lens, t = depth.exposure.lens, depth.exposure.mid_time
+        rho = self.e.download(depth.inverse_z, (lens.camera.height, lens.camera.width))
+        return self._at_once(
+            self._finishing(index, depth, colors, spline, t, spline.pose(t), lens, depth.inverse_z, rho, None)
+        )
 
     def rectified(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None,
         as_now: tuple[float, float] = (1.0, 0.0),
     ) -> Reference:  # fmt: skip
+        """What `rectifying` makes, at once."""
+        return self._at_once(self.rectifying(index, depth, colors, spline, older, as_now))
+
+    def rectifying(
+        self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, older: Reference | None,
+        as_now: tuple[float, float] = (1.0, 0.0),
+    ) -> Making:  # fmt: skip
         """A keyframe at mid readout, in which depth that the older one has is averaged in and fills holes.
 
         Where something moves before it, it has the older one's intensities, times the first of as_now plus the second.
         """
         e, t = self.e, depth.exposure.mid_time
-        with self.timer("keyframes: make"):
-            T_world_base, base, rho = self.rectify(depth, spline)
-            shape = base.camera.height, base.camera.width
-            if older is None or older.rolling is not None:
-                host = e.download(rho, shape)
-                return self._finish(index, depth, colors, spline, t, T_world_base, base, rho, host, None)
-            # The older one is brought here while its slopes are worked out.
-            T = se3.inverse(older.T_world_base) @ T_world_base
-            _, grid = self._pinhole_rays(base)
-            rectify = self._kernel(rectify_kernel, older.lens, base)
-            old, *at = rectify(RectifyInput(older.inverse_depth, *grid, e.upload(rows_of(se3.inverse(T)))))
+        T_world_base, base, rho = self.rectify(depth, spline)
+        shape = base.camera.height, base.camera.width
+        if older is None or older.rolling is not None:
+            yield
             host = e.download(rho, shape)
-            slope_x, slope_y = surface_slopes(host, base.camera.fx, base.camera.fy)
-            seen_from = e.upload(np.concatenate([rows_of(T), np.zeros(6)]))
-            own = rho, e.upload(host > 0), e.upload(slope_x), e.upload(slope_y)
-            rho, weight = self._fuse(own, base, older.lens, older.inverse_depth, older.weight, seen_from)
-            host, old_host = e.download(rho, shape), e.download(old, shape)
-            holes = (host <= 0) & (old_host > 0)
-            host = np.where(holes, old_host, host)
-            weights = np.where(holes, 1.0, e.download(weight, shape))
-            inherited = None
-            if depth.whole is not None and older.intensity is not None:
-                same = (old_host > 0) & (np.abs(old_host - host) < EDGE * host)
-                x, y = (e.download(values, shape) for values in at)
-                inherited = np.float32(as_now[0]) * _looked_up(older.intensity, x, y, same) + np.float32(as_now[1])
-            on_device = e.upload(host)
-            return self._finish(
+            return (yield from self._finishing(index, depth, colors, spline, t, T_world_base, base, rho, host, None))
+        yield
+        host = e.download(rho, shape)
+        # The older one is brought here while slopes are worked out.
+        T = se3.inverse(older.T_world_base) @ T_world_base
+        _, grid = self._pinhole_rays(base)
+        rectify = self._kernel(rectify_kernel, older.lens, base)
+        old, *at = rectify(RectifyInput(older.inverse_depth, *grid, e.upload(rows_of(se3.inverse(T)))))
+        slope_x, slope_y = surface_slopes(host, base.camera.fx, base.camera.fy)
+        yield
+        seen_from = e.upload(np.concatenate([rows_of(T), np.zeros(6)]))
+        own = rho, e.upload(host > 0), e.upload(slope_x), e.upload(slope_y)
+        rho, weight = self._fuse(own, base, older.lens, older.inverse_depth, older.weight, seen_from)
+        yield
+        host, old_host = e.download(rho, shape), e.download(old, shape)
+        holes = (host <= 0) & (old_host > 0)
+        host = np.where(holes, old_host, host)
+        weights = np.where(holes, 1.0, e.download(weight, shape))
+        inherited = None
+        if depth.whole is not None and older.intensity is not None:
+            same = (old_host > 0) & (np.abs(old_host - host) < EDGE * host)
+            x, y = (e.download(values, shape) for values in at)
+            inherited = np.float32(as_now[0]) * _looked_up(older.intensity, x, y, same) + np.float32(as_now[1])
+        on_device = e.upload(host)
+        return (
+            yield from self._finishing(
                 index, depth, colors, spline, t, T_world_base, base, on_device, host, weights, inherited
             )
+        )
 
     def rectify(self, depth: DepthImage, spline: Spline) -> tuple[FloatArray, Lens, Any]:
         """T_world_base (4, 4) at mid readout, the lens, and inverse depth as seen from there at once, on the device."""
@@ -134,8 +160,10 @@ class KeyframeMaker:
     ) -> Reference:  # fmt: skip
         """A keyframe that `rectified` made of these images, with other inverse depth and weights (h, w)."""
         on_device = self.e.upload(rho)
-        return self._finish(
-            made.index, depth, colors, spline, made.t, made.T_world_base, made.lens, on_device, rho, weight
+        return self._at_once(
+            self._finishing(
+                made.index, depth, colors, spline, made.t, made.T_world_base, made.lens, on_device, rho, weight
+            )
         )
 
     def fused(self, ref: Reference, depth: DepthImage, spline: Spline, most: float = _MOST) -> Reference:
@@ -175,11 +203,15 @@ class KeyframeMaker:
         """A rectified keyframe from what `Reference.emptied` left of it, its inverse depth and its weight (h, w)."""
         return self._with_points(self._surface(small, self.e.upload(rho), rho, weight), rho)
 
-    def _finish(
+    def _at_once(self, making: Making) -> Reference:
+        with self.timer("keyframes: make"):
+            return at_once(making)
+
+    def _finishing(
         self, index: int, depth: DepthImage, colors: tuple[ColorImage, ...], spline: Spline, t: float,
         T_world_base: FloatArray, lens: Lens, device_rho: Any, rho: FloatImage, weight: npt.NDArray[Any] | None,
         inherited: FloatImage | None = None,
-    ) -> Reference:  # fmt: skip
+    ) -> Making:  # fmt: skip
         """inherited (h, w): intensities of what rests, NaN where they are not known, for where something moves."""
         e = self.e
         rolling = depth.exposure if lens is depth.exposure.lens and lens.lines > 1 else None
@@ -192,7 +224,7 @@ class KeyframeMaker:
             for level in sorted({0, max(0, color.finer)}):
                 kernel = self._kernel(color_kernel, color.exposure.lens, lens, level)
                 looked_up.append(kernel(ColorInput(device_rho, *grid, seen_at, color.levels[level], seen_from)))
-        # While the device looks colours up.
+        yield
         shown = np.where(rho > 0, 1.0, 0.0) if weight is None else weight
         small = Reference(
             index, depth.exposure.stamp, t, T_world_base, lens, rolling, None, None, None, None, None, (), 1.0, 1.0, 0,
@@ -201,6 +233,7 @@ class KeyframeMaker:
         made = self._surface(small, device_rho, rho, shown)
         if color is None:
             return made
+        yield
         known = ((e.download(value, rho.shape), e.download(seen, rho.shape) > 0) for value, seen in looked_up)
         images = [np.where(seen, value, np.nan).astype(np.float32) for value, seen in known]
         if depth.whole is not None:

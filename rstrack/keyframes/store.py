@@ -14,7 +14,7 @@ from rstrack.images.device_frame import DeviceFrame
 from rstrack.images.pyramid import ColorImage, DepthImage
 from rstrack.keyframes.archive import Archive
 from rstrack.keyframes.keyframe import Reference
-from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.keyframes.maker import KeyframeMaker, Making
 from rstrack.options import Options
 from rstrack.volume.volume import Volume
 
@@ -101,20 +101,27 @@ class KeyframeStore:
         self._use(ref)
         self.anchor = None
 
-    def make(
+    def making(
         self, frame: DeviceFrame, spline: Spline, older: Reference | None, brightness: FloatArray,
         as_now: tuple[float, float] = (1.0, 0.0),
-    ) -> Reference:  # fmt: skip
-        """A keyframe of a frame whose poses no longer change; inherits from `older`. It is the newest.
+    ) -> Making:  # fmt: skip
+        """A keyframe of a frame whose poses no longer change; inherits from `older`. Not in the store yet: `add`.
 
-        brightness (2,): gain and offset of its colour image, see `Reference`. as_now: see `KeyframeMaker.rectified`.
+        brightness (2,): gain and offset of its colour image, see `Reference`. as_now: see `KeyframeMaker.rectifying`.
         """
-        make = self._maker.rectified if self._model is None else self._model.keyframe
-        ref = replace(make(frame.index, frame.depth, frame.colors, spline, older, as_now), brightness=brightness)
+        made_of = frame.index, frame.depth, frame.colors, spline, older, as_now
+        if self._model is None:
+            made = yield from self._maker.rectifying(*made_of)
+        else:
+            made = self._model.keyframe(*made_of)
+        return replace(made, brightness=brightness)
+
+    def add(self, made: Reference, frame: DeviceFrame, spline: Spline) -> Reference:
+        """What `making` has made of a frame: the newest keyframe from now on."""
         if self._model is not None:
             self._model.add(frame.depth, spline)
         self.made += 1
-        return self._use(ref)
+        return self._use(made)
 
     def fuse(self, frame: DeviceFrame, spline: Spline) -> Reference:
         """The newest keyframe with the depth of a later frame averaged in, as far as the options want that."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from rstrack.alignment.spline_state import SplineState
 from rstrack.data.moving_masks import Mask
 from rstrack.images.device_frame import DeviceFrame
 from rstrack.keyframes.keyframe import Reference
-from rstrack.keyframes.maker import KeyframeMaker
+from rstrack.keyframes.maker import KeyframeMaker, Making
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 from rstrack.tracking.judgement.uncertainty import PoseCovariances
@@ -30,6 +31,8 @@ from rstrack.tracking.window import Window
 LEAST_DEPTH = 0.02
 # Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
 _COLORLESS = 5
+# A frame has time for as many of the parts of a keyframe as that has fewer pixels: one of six at 640x480.
+_PART_PX = 2 * 320 * 240
 # Frames that have to see through a keyframe's pixel, or find it elsewhere, for it to be gone.
 _SEEN_THROUGH = 3
 
@@ -64,6 +67,38 @@ class Gains:
         self.moments = frame.colors[0].moments
 
 
+@dataclass
+class _Making:
+    """A keyframe in the making, of a frame whose poses T_world_depth(t) no longer change: parts with every new frame.
+
+    left: parts until `made` takes over, where it was made at once since it was to be stored.
+    """
+
+    frame: DeviceFrame
+    spline: Spline
+    parts: Making | None
+    made: Reference | None = None
+    left: int = 0
+
+    def goes_on(self) -> bool:
+        """Do the next part; whether that was the last one."""
+        if self.parts is None:
+            self.left -= 1
+            return self.left == 0
+        try:
+            next(self.parts)
+        except StopIteration as end:
+            self.made, self.parts = end.value, None
+        return self.made is not None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All parts are done, but it takes over when it would have: what is stored goes on as what is not."""
+        while self.parts is not None:
+            self.goes_on()
+            self.left += 1
+        return vars(self)
+
+
 class Succession:
     """reference: what new frames are aligned to, a keyframe or, where it cannot be rectified yet, a rolling frame.
 
@@ -79,6 +114,8 @@ class Succession:
         self.recent: deque[DeviceFrame] = deque()
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
+        # The next reference, while it is worked on.
+        self._making: _Making | None = None
         # The most pixels that a frame saw of each reference, since it was made.
         self._pixels: dict[int, int] = {}
         # Frames in a row whose colours did not fit the reference's own.
@@ -130,18 +167,37 @@ class Succession:
         self.recent = deque([frame])
 
     def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
-        """A keyframe, rectified with T_world_depth(t) and joined with what an older one saw."""
+        """A keyframe, rectified with T_world_depth(t) and joined with what an older one saw, at once."""
+        making = self._begun(frame, spline, older)
+        while not self._goes_on(making):
+            pass
+        return self._succeeded(making)
+
+    def _goes_on(self, making: _Making) -> bool:
+        """Do what a frame has time for; whether the keyframe is done."""
+        camera = making.frame.depth.exposure.lens.camera
+        with self._maker.timer("keyframes: make"):
+            return any(making.goes_on() for _ in range(max(1, _PART_PX // (camera.width * camera.height))))
+
+    def _begun(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> _Making:
         own = self._gains.of(frame)
         as_now = (1.0, 0.0) if older is None else factor_and_offset(relative(own, older.brightness))
-        made = self._store.make(frame, spline, older, own, as_now)
+        return _Making(frame, spline, self._store.making(frame, spline, older, own, as_now))
+
+    def _succeeded(self, making: _Making) -> Reference:
+        assert making.made is not None
+        made = self._store.add(making.made, making.frame, making.spline)
         self._covariances.keyframe(made)
         self._refer_to(made)
         return made
 
     def fuse_frozen(self, window: Window) -> DeviceFrame | None:
-        """Fuse the frames whose control points are frozen but the newest of them, which is returned."""
+        """Fuse the frames whose control points are frozen but the newest of them, which is returned.
+
+        Not yet while a keyframe is in the making that they may be fused into.
+        """
         frozen = [f for f in self.recent if window.is_frozen(f.last_time)]
-        for done in frozen[:-1]:
+        for done in frozen[:-1] if self._making is None else ():
             self.recent.popleft()
             before = self._store.newest
             after = self._store.fuse(done, window.spline)
@@ -154,6 +210,8 @@ class Succession:
 
         Says whether it has become a keyframe.
         """
+        if self._making is not None:
+            return self._take_over()
         if self._unconverged is not None:
             if not window.is_frozen(self._unconverged.last_time):
                 return False
@@ -180,7 +238,15 @@ class Succession:
             return True
         if self.is_unfit(frozen):
             return False
-        self.make(frozen, window.spline, ref if self._options.fuse else None)
+        self._making = self._begun(frozen, window.spline, ref if self._options.fuse else None)
+        return self._take_over()
+
+    def _take_over(self) -> bool:
+        """Go on with the keyframe in the making; whether it is the reference now."""
+        making = self._making
+        if making is None or not self._goes_on(making):
+            return False
+        self._succeeded(making)
         return True
 
     def _refer_to(self, ref: Reference, is_found: bool = False) -> None:
@@ -188,5 +254,5 @@ class Succession:
         if not is_found:
             self._pixels.pop(ref.index, None)
         self.reference = ref
-        self._unconverged, self._colorless = None, 0
+        self._unconverged, self._making, self._colorless = None, None, 0
         self._gone = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from rsgen.geometry import se3
 from rstrack.keyframes import store
+from rstrack.keyframes.maker import at_once
 from rstrack.keyframes.store import KeyframeStore
 from rstrack.options import Options
 
@@ -47,6 +49,10 @@ class Maker:
         self, index: int, depth: str, colors: Any, pose: np.ndarray, older: Any, as_now: tuple[float, float]
     ) -> Any:
         return Stub(index, pose, depth, older, "maker")
+
+    def rectifying(self, *made_of: Any) -> Iterator[None]:
+        yield
+        return self.rectified(*made_of)
 
     def fused(self, ref: Any, depth: str, pose: np.ndarray) -> Any:
         return replace(ref, depth=f"{ref.depth}, {depth}")
@@ -107,7 +113,8 @@ def keyframes(**options: Any) -> KeyframeStore:
 
 
 def make(kept: KeyframeStore, index: int, pose: np.ndarray, older: Any = None) -> Any:
-    return kept.make(frame(index), pose, older, BRIGHTNESS)  # type: ignore[arg-type]
+    made = at_once(kept.making(frame(index), pose, older, BRIGHTNESS))  # type: ignore[arg-type]
+    return kept.add(made, frame(index), pose)  # type: ignore[arg-type]
 
 
 def recent(kept: KeyframeStore) -> list[Any]:

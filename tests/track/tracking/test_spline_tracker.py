@@ -18,9 +18,10 @@ from rsgen.geometry.shutter import Shutter
 from rstrack.alignment.weights import Independence
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Method, Options
-from rstrack.tracking import bootstrap
+from rstrack.tracking import bootstrap, succession
 from rstrack.tracking.frame_report import Fault
 from rstrack.tracking.spline_tracker import Tracker
+from rstrack.tracking.succession import Succession
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 ROLLING, GLOBAL = Shutter(readout_s=0.028), Shutter()
@@ -291,6 +292,33 @@ def test_the_newest_frame_serves_as_a_rolling_reference_until_it_is_rectified(me
     changes = np.flatnonzero(np.diff(np.array(rolling[6:], int)) < 0)
     assert len(changes) >= 2 and tracker.keyframes == 1 + len(changes)
     assert lost(tracker) == [] and worst_step(tracker) < 1e-3
+
+
+def test_a_keyframe_is_made_part_by_part_while_the_old_one_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(succession, "_PART_PX", 1)
+    tracker, begun, serving = tracker_of("rs-pg", keyframe_distance=0.03), [], []
+    begin = Succession._begun
+    monkeypatch.setattr(Succession, "_begun", lambda self, *made_of: begun.append(made_of) or begin(self, *made_of))
+    for k in range(24):
+        tracker.feed(frame_at(k))
+        if len(begun) == 2:  # the first one is the start's
+            serving.append(tracker.reference)
+            if tracker.reference != serving[0]:
+                break
+    frame, spline, older = begun[1]
+    assert serving == [older.index] * 5 + [frame.index] and tracker.reports[-1].keyframe and not lost(tracker)
+    # What the parts have made is what is made at once; the frames since are fused into it then.
+    track = tracker.track
+    made, download = track.keyframes.newest, track.device.e.download
+    at_once = track.maker.rectified(frame.index, frame.depth, frame.colors, spline, older)
+    for name in ("inverse_depth", "weight", "roughness"):
+        assert np.array_equal(*(download(getattr(ref, name), (120, 160)) for ref in (made, at_once))), name
+    np.testing.assert_array_equal(made.intensity, at_once.intensity)
+    waiting = [f.index for f in track.succession.recent]
+    assert waiting[0] == frame.index and len(waiting) > 5
+    tracker.feed(frame_at(len(tracker.reports)))
+    fused, alone = (download(ref.weight, (120, 160)).max() for ref in (track.keyframes.newest, made))
+    assert fused >= alone + 3 and len(track.succession.recent) < len(waiting)
 
 
 def test_frames_out_of_order_or_of_another_camera() -> None:
