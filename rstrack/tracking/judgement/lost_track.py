@@ -98,9 +98,11 @@ def _least_fit(o: Observation) -> float:
 
 
 def is_settled(solved: Solved) -> bool:
-    """Whether the last step hardly moved a row, or by no more than noise does; or, where there was no time for more, is
-    part of the pose's covariance."""
-    return solved.is_within_noise or solved.is_cut or solved.last_shift <= _WORST_SHIFT_PX
+    """Whether the last step hardly moved a row, or by no more than noise does.
+
+    No less where there was no time for more: with four or eight steps a frame such frames were silently wrong.
+    """
+    return solved.is_within_noise or solved.last_shift <= _WORST_SHIFT_PX
 
 
 def implausible(T_predicted: FloatArray, T_found: FloatArray, dt: float) -> bool:

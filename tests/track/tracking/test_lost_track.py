@@ -64,6 +64,7 @@ def test_rows_that_still_move_by_more_than_two_pixels_have_not_been_found() -> N
     assert fault([term("depth", 1e-3)], shift=2.001) == UNSETTLED
     assert fault([term("depth", 1e-3)], shift=float("inf")) == UNSETTLED
     assert is_settled(Solved(last_shift=2.1, is_within_noise=True)), "noise ended it"
+    assert not is_settled(Solved(last_shift=2.1, is_cut=True)), "it may be anywhere"
 
 
 def test_a_coarse_level_is_hopeless_where_neither_term_fits() -> None:
