@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,9 @@ from rstrack.tracking.window import Window
 LEAST_DEPTH = 0.02
 # Frames in a row whose colours do not fit the keyframe's after which it is the keyframe's that are wrong.
 _COLORLESS = 5
-# A frame has time for as many of the parts of a keyframe as that has fewer pixels: one of six at 640x480.
-_PART_PX = 2 * 320 * 240
+# Parts that a keyframe is made in (`Making`), all within this share of the frames for which the one before has served:
+# six frames each time and fr1_rpy, where one serves for seven, loses frames. Small images have more parts a frame.
+_PARTS, _LATE, _PART_PX = 6, 0.2, 2 * 320 * 240
 # Frames that have to see through a keyframe's pixel, or find it elsewhere, for it to be gone.
 _SEEN_THROUGH = 3
 
@@ -71,12 +73,13 @@ class Gains:
 class _Making:
     """A keyframe in the making, of a frame whose poses T_world_depth(t) no longer change: parts with every new frame.
 
-    left: parts until `made` takes over, where it was made at once since it was to be stored.
+    a_frame: parts that are done with one. left: those until `made` takes over, where all are done since it was stored.
     """
 
     frame: DeviceFrame
     spline: Spline
     parts: Making | None
+    a_frame: int
     made: Reference | None = None
     left: int = 0
 
@@ -168,21 +171,23 @@ class Succession:
 
     def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
         """A keyframe, rectified with T_world_depth(t) and joined with what an older one saw, at once."""
-        making = self._begun(frame, spline, older)
+        making = self._begun(frame, spline, older, 0)
         while not self._goes_on(making):
             pass
         return self._succeeded(making)
 
     def _goes_on(self, making: _Making) -> bool:
         """Do what a frame has time for; whether the keyframe is done."""
-        camera = making.frame.depth.exposure.lens.camera
         with self._maker.timer("keyframes: make"):
-            return any(making.goes_on() for _ in range(max(1, _PART_PX // (camera.width * camera.height))))
+            return any(making.goes_on() for _ in range(making.a_frame))
 
-    def _begun(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> _Making:
+    def _begun(self, frame: DeviceFrame, spline: Spline, older: Reference | None, served: int) -> _Making:
+        """served: frames for which the one before has."""
+        camera = frame.depth.exposure.lens.camera
+        a_frame = ceil(_PARTS / max(1, int(_LATE * served))) * max(1, _PART_PX // (camera.width * camera.height))
         own = self._gains.of(frame)
         as_now = (1.0, 0.0) if older is None else factor_and_offset(relative(own, older.brightness))
-        return _Making(frame, spline, self._store.making(frame, spline, older, own, as_now))
+        return _Making(frame, spline, self._store.making(frame, spline, older, own, as_now), a_frame)
 
     def _succeeded(self, making: _Making) -> Reference:
         assert making.made is not None
@@ -238,7 +243,8 @@ class Succession:
             return True
         if self.is_unfit(frozen):
             return False
-        self._making = self._begun(frozen, window.spline, ref if self._options.fuse else None)
+        older = ref if self._options.fuse else None
+        self._making = self._begun(frozen, window.spline, older, frozen.index - ref.index)
         return self._take_over()
 
     def _take_over(self) -> bool:

@@ -85,13 +85,14 @@ def files(run: Path) -> dict[str, bytes]:
     return {name: (run / name).read_bytes() for name in ("trajectory.txt", "spline.npz")}
 
 
-@pytest.mark.parametrize("part_px", [1, succession._PART_PX])  # of small images a keyframe is made at once
+@pytest.mark.parametrize("late", [100.0, 0.0])  # keyframes part by part, and at once
 @pytest.mark.parametrize("memory_gb, reference", [(2.0, "keyframe"), (1e-6, "keyframe"), (2.0, "model")])
 def test_a_run_that_crashes_again_and_again_comes_to_the_same_bits(
-    dataset: Dataset, tmp_path: Path, often: None, memory_gb: float, reference: str, part_px: int,
+    dataset: Dataset, tmp_path: Path, often: None, memory_gb: float, reference: str, late: float,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(succession, "_PART_PX", part_px)
+    monkeypatch.setattr(succession, "_PART_PX", 1)
+    monkeypatch.setattr(succession, "_LATE", late)
     options = Options(**(vars(OPTIONS) | {"memory_gb": memory_gb, "reference": reference, "voxel_m": 0.03}))
     whole = track(dataset, options, tmp_path / "whole", noise=NOISE)
     for count in (2, 5, 2, 4):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -296,6 +297,7 @@ def test_the_newest_frame_serves_as_a_rolling_reference_until_it_is_rectified(me
 
 def test_a_keyframe_is_made_part_by_part_while_the_old_one_serves(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(succession, "_PART_PX", 1)
+    monkeypatch.setattr(succession, "_LATE", 100.0)
     tracker, begun, serving = tracker_of("rs-pg", keyframe_distance=0.03), [], []
     begin = Succession._begun
     monkeypatch.setattr(Succession, "_begun", lambda self, *made_of: begun.append(made_of) or begin(self, *made_of))
@@ -305,7 +307,7 @@ def test_a_keyframe_is_made_part_by_part_while_the_old_one_serves(monkeypatch: p
             serving.append(tracker.reference)
             if tracker.reference != serving[0]:
                 break
-    frame, spline, older = begun[1]
+    frame, spline, older, _ = begun[1]
     assert serving == [older.index] * 5 + [frame.index] and tracker.reports[-1].keyframe and not lost(tracker)
     # What the parts have made is what is made at once; the frames since are fused into it then.
     track = tracker.track
@@ -319,6 +321,20 @@ def test_a_keyframe_is_made_part_by_part_while_the_old_one_serves(monkeypatch: p
     tracker.feed(frame_at(len(tracker.reports)))
     fused, alone = (download(ref.weight, (120, 160)).max() for ref in (track.keyframes.newest, made))
     assert fused >= alone + 3 and len(track.succession.recent) < len(waiting)
+
+
+@pytest.mark.parametrize(
+    ("served", "size", "parts"),
+    [(0, (640, 480), 6), (9, (640, 480), 6), (10, (640, 480), 3), (29, (640, 480), 2), (30, (640, 480), 1),
+     (30, (320, 240), 2), (30, (160, 120), 8), (300, (1280, 960), 1)],
+)  # fmt: skip
+def test_the_longer_a_keyframe_has_served_the_more_time_the_next_one_takes(
+    served: int, size: tuple[int, int], parts: int
+) -> None:
+    succeeding = tracker_of("rs-pg").track.succession
+    frame: Any = SimpleNamespace(depth=SimpleNamespace(exposure=SimpleNamespace(lens=SimpleNamespace(
+        camera=Camera(*size, 1.0, 1.0, 0.0, 0.0)))), index=0, colors=())  # fmt: skip
+    assert succeeding._begun(frame, TRUTH, None, served).a_frame == parts
 
 
 def test_frames_out_of_order_or_of_another_camera() -> None:
