@@ -117,8 +117,9 @@ class Succession:
         self.recent: deque[DeviceFrame] = deque()
         # The newest frame, while it is the reference and cannot be rectified yet.
         self._unconverged: DeviceFrame | None = None
-        # The next reference, while it is worked on.
+        # The next reference, while it is worked on, and the newest frame when the one before became it.
         self._making: _Making | None = None
+        self._since = 0
         # The most pixels that a frame saw of each reference, since it was made.
         self._pixels: dict[int, int] = {}
         # Frames in a row whose colours did not fit the reference's own.
@@ -166,8 +167,8 @@ class Succession:
     def use(self, found: Reference, frame: DeviceFrame) -> None:
         """Go on with a keyframe that a lost frame has been found by."""
         self._store.use(found)
-        self._refer_to(found, is_found=True)
         self.recent = deque([frame])
+        self._refer_to(found, is_found=True)
 
     def make(self, frame: DeviceFrame, spline: Spline, older: Reference | None) -> Reference:
         """A keyframe, rectified with T_world_depth(t) and joined with what an older one saw, at once."""
@@ -182,7 +183,7 @@ class Succession:
             return any(making.goes_on() for _ in range(making.a_frame))
 
     def _begun(self, frame: DeviceFrame, spline: Spline, older: Reference | None, served: int) -> _Making:
-        """served: frames for which the one before has."""
+        """served: frames for which the one before has, or 0."""
         camera = frame.depth.exposure.lens.camera
         a_frame = ceil(_PARTS / max(1, int(_LATE * served))) * max(1, _PART_PX // (camera.width * camera.height))
         own = self._gains.of(frame)
@@ -244,7 +245,7 @@ class Succession:
         if self.is_unfit(frozen):
             return False
         older = ref if self._options.fuse else None
-        self._making = self._begun(frozen, window.spline, older, frozen.index - ref.index)
+        self._making = self._begun(frozen, window.spline, older, new.index - self._since)
         return self._take_over()
 
     def _take_over(self) -> bool:
@@ -259,6 +260,6 @@ class Succession:
         """is_found: by a lost frame, which may see half of it."""
         if not is_found:
             self._pixels.pop(ref.index, None)
-        self.reference = ref
+        self.reference, self._since = ref, self.recent[-1].index if self.recent else ref.index
         self._unconverged, self._making, self._colorless = None, None, 0
         self._gone = None

@@ -232,7 +232,7 @@ def test_who_comes_back_to_a_keyframe_may_see_half_of_it() -> None:
     assert [succession.overlap(pixels_of(3, n)) for n in (800, 1000, 600)] == [1.0, 1.0, 0.6]
     succession._refer_to(cast(Any, SimpleNamespace(index=7)))
     assert [succession.overlap(pixels_of(7, n)) for n in (500, 400)] == [1.0, pytest.approx(0.8)]
-    succession.use(cast(Any, SimpleNamespace(index=3)), nothing)
+    succession.use(cast(Any, SimpleNamespace(index=3)), cast(Any, SimpleNamespace(index=9)))
     assert succession.overlap(pixels_of(3, 500)) == 0.5
     # One that is made again of the same frame, rectified, is another.
     succession._refer_to(cast(Any, SimpleNamespace(index=3)))
