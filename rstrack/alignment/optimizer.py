@@ -20,6 +20,8 @@ from rstrack.alignment.spline_state import SplineState
 
 # A step that moves no line further is the last one, at the coarse levels and at the finest (pixels).
 STOP_PX = (0.02, 0.1, 0.3)
+SETTLED_PX = 2.0
+"""Beyond a last step that moves lines further an alignment may be anywhere: no time is too short to go on."""
 # Lines that have moved less since a linearisation keep it.
 RELINEARISE_PX = 0.02
 # The same where all but the noise is predicted.
@@ -109,7 +111,8 @@ def _optimise_level(terms: Terms, state: SplineState, problem: Problem, level: i
     once_more = problem.predicted and level == 0
     done.is_cut = False
     for n in range(most):
-        if n and not terms.pace.allows_step(level):
+        may_end = n > 0 and (level > 0 or done.last_shift <= SETTLED_PX)
+        if may_end and not terms.pace.allows_step(level):
             done.is_cut = True
             break
         with terms.pace.step(level):

@@ -11,6 +11,7 @@ import synthetic
 from rsgen.errors import UserError
 from rsgen.geometry.camera import Camera
 from rsgen.geometry.shutter import Shutter
+from rstrack.alignment import optimizer
 from rstrack.alignment.pace import Pace
 from rstrack.data.rig import Frame, Image, Rig
 from rstrack.options import Options
@@ -119,3 +120,12 @@ def test_frames_without_time_are_cut_and_say_so_and_are_no_worse_than_their_cova
         np.sqrt(np.trace((r.covariance + r.drift_world)[:3, :3])) for r in short.reports if r.covariance is not None
     ]
     assert error.max() < 0.02 and np.mean(error[-len(sigma) :] < 3.0 * np.array(sigma)) > 0.9
+
+
+def test_no_time_is_too_short_for_the_steps_without_which_a_frame_would_be_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settled_px = 0.02  # of images that are as small as these a step moves lines by little
+    monkeypatch.setattr(optimizer, "SETTLED_PX", settled_px)
+    cut = [report for report in tracked(Clock(tick=1e-3), 10.0).reports if report.is_cut]
+    assert len(cut) > 3 and max(r.iterations for r in cut) > 3 and max(r.last_shift_px for r in cut) <= settled_px
