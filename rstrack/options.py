@@ -98,7 +98,7 @@ class Options:
     ] = None
     budget_ms: Annotated[
         float | None,
-        "time for a frame, ms: alignment ends before it is done, and keyframes wait for the next frame, where there is "
+        "time for a frame, ms: once settled, alignment ends before it is done, and keyframes wait, where there is "
         "no time left; such poses have a larger covariance (default: as long as it takes; with a budget results depend "
         "on how fast the machine is)",
     ] = None

@@ -244,8 +244,11 @@ def test_the_live_loop_says_what_it_dropped(tmp_path: Path, capsys: pytest.Captu
     load("live_loop").main(words, clock, clock.sleep)
     first, second, third = capsys.readouterr().out.splitlines()
     assert first == "6 frames in 0.2 s: 6 fed, 0 dropped, 0 lost, 0 cut short"
-    assert second.startswith("latency of all, ms: median 0.0, 95 % 0.0") and third.endswith("the same bits")
+    assert second.startswith("latency, ms: median 0.0, 95 % 0.0") and third.endswith("the same bits")
     assert clock.now == pytest.approx(5.0 + 5 / 30)
+    with pytest.raises(SystemExit):
+        load("live_loop").main([str(root), "--queue", "0"])
+    assert "--queue 0: one frame at least" in capsys.readouterr().err
 
 
 NOTEBOOKS = [EXAMPLES / "scene_to_table.ipynb", EXAMPLES / "quickstart.ipynb"]

@@ -34,8 +34,8 @@ def survivors(
 ) -> Iterator[tuple[int, float]]:  # fmt: skip
     """Numbers of the frames that are not dropped, and when each arrived, s: in order, waited for if need be.
 
-    clock, sleep: as of `time`, in s. Between two numbers the caller works, and frames go on arriving. Of every `queue`
-    frames that wait beyond the first one more is skipped, so that the camera never moves far between two.
+    clock, sleep: as of `time`, in s. Between two numbers the caller works, and frames go on arriving. Where more than
+    `queue` frames wait one is skipped for each that is taken, where more than twice as many wait two, and so on.
     """
     begin, arrived, waiting = clock(), 0, deque[int]()
     while arrived < count or waiting:
@@ -82,6 +82,8 @@ def main(
     )
     parser.add_argument("--check", action="store_true", help="feed the survivors again without a clock: the same bits?")
     given = parser.parse_args(words)
+    if given.queue < 1:
+        parser.error(f"--queue {given.queue}: one frame at least has to wait")
 
     dataset = open_dataset(given.recording, given.camera)
     count = int(min(len(dataset.stamps), given.seconds * given.hz))
@@ -98,11 +100,11 @@ def main(
     lost, cut = (sum(getattr(report, name) for report in tracker.reports) for name in ("lost", "is_cut"))
     told = f"{len(fed)} fed, {count - len(fed)} dropped, {lost} lost, {cut} cut short"
     print(f"{count} frames in {count / given.hz:.1f} s: {told}")
-    for name, after in (("all", 0.0), ("from 3 s on", 3.0)):
+    for name, after in (("", 0.0), (" from 3 s on", 3.0)):
         late = 1e3 * seconds[np.array(fed) >= after * given.hz]
         if len(late):
             median, p95, p99 = np.percentile(late, [50, 95, 99])
-            print(f"latency of {name}, ms: median {median:.1f}, 95 % {p95:.1f}, 99 % {p99:.1f}, worst {late.max():.1f}")
+            print(f"latency{name}, ms: median {median:.1f}, 95 % {p95:.1f}, 99 % {p99:.1f}, worst {late.max():.1f}")
     if given.check:
         again = new()
         for n in fed:

@@ -22,7 +22,7 @@ import pyrealsense2 as rs
 from rsgen import Camera, Shutter
 from rstrack import Frame, Image, Options, Rig, Tracker
 
-# Frames that may wait before every second one is skipped: a start takes a second or two.
+# Frames that may wait before every second one is skipped: a start takes half a second to two.
 QUEUE = 30
 
 

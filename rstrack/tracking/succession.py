@@ -73,13 +73,13 @@ class Gains:
 class _Making:
     """A keyframe in the making, of a frame whose poses T_world_depth(t) no longer change: parts with every new frame.
 
-    a_frame: parts that are done with one. left: those until `made` takes over, where all are done since it was stored.
+    per_frame: parts done with each. left: those until `made` takes over, where all are done since it was stored.
     """
 
     frame: DeviceFrame
     spline: Spline
     parts: Making | None
-    a_frame: int
+    per_frame: int
     made: Reference | None = None
     left: int = 0
 
@@ -180,15 +180,15 @@ class Succession:
     def _goes_on(self, making: _Making) -> bool:
         """Do what a frame has time for; whether the keyframe is done."""
         with self._maker.timer("keyframes: make"):
-            return any(making.goes_on() for _ in range(making.a_frame))
+            return any(making.goes_on() for _ in range(making.per_frame))
 
     def _begun(self, frame: DeviceFrame, spline: Spline, older: Reference | None, served: int) -> _Making:
         """served: frames for which the one before has, or 0."""
         camera = frame.depth.exposure.lens.camera
-        a_frame = ceil(_PARTS / max(1, int(_LATE * served))) * max(1, _PART_PX // (camera.width * camera.height))
+        per_frame = ceil(_PARTS / max(1, int(_LATE * served))) * max(1, _PART_PX // (camera.width * camera.height))
         own = self._gains.of(frame)
         as_now = (1.0, 0.0) if older is None else factor_and_offset(relative(own, older.brightness))
-        return _Making(frame, spline, self._store.making(frame, spline, older, own, as_now), a_frame)
+        return _Making(frame, spline, self._store.making(frame, spline, older, own, as_now), per_frame)
 
     def _succeeded(self, making: _Making) -> Reference:
         assert making.made is not None

@@ -334,7 +334,7 @@ def test_the_longer_a_keyframe_has_served_the_more_time_the_next_one_takes(
     succeeding = tracker_of("rs-pg").track.succession
     frame: Any = SimpleNamespace(depth=SimpleNamespace(exposure=SimpleNamespace(lens=SimpleNamespace(
         camera=Camera(*size, 1.0, 1.0, 0.0, 0.0)))), index=0, colors=())  # fmt: skip
-    assert succeeding._begun(frame, TRUTH, None, served).a_frame == parts
+    assert succeeding._begun(frame, TRUTH, None, served).per_frame == parts
 
 
 def test_frames_out_of_order_or_of_another_camera() -> None:
