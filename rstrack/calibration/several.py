@@ -68,7 +68,8 @@ def together(found: Sequence[CameraCalibration]) -> CameraCalibration:
         for each, (_, _, K) in zip(found, reduced, strict=True)
     }
     asked = np.logical_or.reduce([each.asked for each in found]) & ~_CLOCK
-    patterns = [each.dataset.depth_error.pattern for each in found if each.dataset.depth_error.pattern]
+    estimated = [each.dataset.depth_error.pattern for each in found if each.pattern_note]
+    patterns = [pattern for pattern in estimated if pattern]
     dataset, pattern_note = first.dataset, ""
     if patterns:
         dataset = dataset.with_depth_pattern(tuple(float(x) for x in np.mean(patterns, axis=0)))

@@ -37,9 +37,9 @@ class Recorded:
 
 def calibrated(
     name: str, true: np.ndarray, own: np.ndarray, sure: np.ndarray, rng: np.random.Generator,
-    pattern: tuple[float, ...] | None = None,
+    pattern: tuple[float, ...] | None = None, note: str = "estimated from it",
 ) -> CameraCalibration:  # fmt: skip
-    """A recording whose eight windows bear out `true` (31,), though it has ended at `own`."""
+    """A recording whose eight windows bear out `true` (31,), though it has ended at `own`; note: on its pattern."""
     free = np.isin(np.arange(COUNT), AT)
     root = rng.standard_normal((8, 4, 4)) * sure[:, None]
     A = root @ root.swapaxes(1, 2)
@@ -48,7 +48,8 @@ def calibrated(
     shutter = SimpleNamespace(scan="top-bottom")
     dataset: Any = Recorded(name, SimpleNamespace(color_shutter=shutter), DepthError(pattern=pattern))
     unused: Any = None
-    return CameraCalibration(dataset, START, solution, free, (range(30),), unused, 1.0, unused, unused)
+    parts = (range(30),)
+    return CameraCalibration(dataset, START, solution, free, parts, unused, 1.0, unused, unused, pattern_note=note)
 
 
 def test_recordings_tell_what_the_others_do_not_and_keep_their_clocks() -> None:
@@ -69,6 +70,12 @@ def test_recordings_tell_what_the_others_do_not_and_keep_their_clocks() -> None:
     assert not made.solution.free[OFFSET] and not made.asked[OFFSET] and len(made.parts) == 2
     for name, offset in zip(("recording0", "recording1"), clocks, strict=True):
         assert made.clocks[name] == (pytest.approx(offset, abs=2e-4), 0.0)
+
+
+def test_a_pattern_that_the_camera_file_states_is_not_said_to_be_a_mean() -> None:
+    rng, none, sure = np.random.default_rng(5), np.zeros(COUNT), np.full(4, 1e3)
+    made = together([calibrated(f"recording{k}", none, none, sure, rng, (0.01, 0.02), note="") for k in range(2)])
+    assert made.dataset.depth_error.pattern == (0.01, 0.02) and not made.pattern_note
 
 
 def test_recordings_of_different_cameras_or_of_one_name_are_refused() -> None:
